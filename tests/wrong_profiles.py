@@ -197,7 +197,7 @@ WRONG: list[tuple[str, str]] = [
     (
         "robot: {driver: ros}",
         "lab.yaml:2: robot.driver: no robot driver 'ros' is installed; did you mean 'ros2'? "
-        f"Installed: {', '.join(DRIVERS)}. Install the package that brings it",
+        f"Installed: {', '.join(DRIVERS)}. Install its package",
     ),
     ("robot: {tcp_frame: ''}", "robot.tcp_frame: must not be empty"),
     (
@@ -212,7 +212,7 @@ WRONG: list[tuple[str, str]] = [
     (
         "cameras: {front: {source: 'v4l:0'}}",
         "lab.yaml:2: cameras.front.source: 'v4l:0': no camera source 'v4l' is installed; did you "
-        "mean 'v4l2'? Installed: file, realsense, ros2, rtsp, rtsps, sim, v4l2. Install the",
+        "mean 'v4l2'? Installed: file, realsense, ros2, rtsp, rtsps, sim, v4l2. Install its",
     ),
     (
         "cameras: {front: {source: 'sim:'}}",

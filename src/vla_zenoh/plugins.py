@@ -281,7 +281,7 @@ def load(group: Group[Declaration], name: str) -> Declaration:
     if name not in known:
         raise PluginError(
             f"no {group.noun} {name!r} is installed{nearest(name, known)} Installed: "
-            f"{', '.join(known) or 'none'}. Install the package that brings it into {sys.prefix}, "
+            f"{', '.join(known) or 'none'}. Install its package into {sys.prefix}, "
             "the environment of this program: docs/how-to/install.md"
         )
     entry, *others = _found(group.name, tuple(sys.path))[name]

@@ -212,7 +212,10 @@ LIBERO: dict[str, list[Any]] = {
 
 
 def steps_of(policy: Policy, rows: Any) -> Any:
-    return vars(policy)["_meaning"].steps(np.array(rows))
+    """Steps with positions in metres: on the wire they are in the unit that the spec says."""
+    steps = vars(policy)["_meaning"].steps(np.array(rows))
+    steps[:, :3] *= policy.spec.action.position_scale_m
+    return steps
 
 
 @pytest.mark.parametrize("key", ["libero_spatial_no_noops", "libero_90"])
@@ -240,6 +243,7 @@ def test_the_native_worker_and_the_server_of_the_same_weights_ask_for_the_same(
     served: Any = make_policy(find_model("openvla_rest"), {"preset": "libero"})
     rows = np.array([[0.5, -0.25, 0.125, 0.1, -0.2, 0.3, 1.0]])
     theirs = served.mapping.read(rows).steps
+    theirs[:, :3] *= served.spec.action.position_scale_m
     np.testing.assert_allclose(steps_of(native, rows), theirs, atol=ATOL)
     assert native.spec.action.controller == served.spec.action.controller
     assert native.spec.action.rotation == served.spec.action.rotation

@@ -376,7 +376,7 @@ class MotionPipeline:
                 dropped = self._hold(mover, timeline, now_ns)
         elif back is not self._back:
             # Whatever the speed override: an arm in contact has to come free.
-            here_m = mover.motion.pose.position_m
+            here_m = mover.tcp.pose.position_m
             inside_m, _ = into_workspace(self._limits, back.position_m, here_m)
             inside_pose, hits = self._within_reach(mover.motion.pose, Pose(inside_m, back.rotation))
             inside = Goal(inside_pose, 0.0)

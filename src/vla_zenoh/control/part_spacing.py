@@ -22,6 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vla_zenoh.control.commanded_part import CommandedPart
+from vla_zenoh.control.joint_space import PROBE_RAD
 from vla_zenoh.control.limits import LimitHit, Slowdown, between, in_steps
 from vla_zenoh.control.watchdog import BAND, PAST, PERIOD_NS
 from vla_zenoh.kinematics.collision import Nearest, PlacedArm
@@ -42,8 +43,6 @@ LEAST_NEAR_PART = 0.05
 """Least share of the speed near the stop: the arms are held there, and have to come away again."""
 STANDS_RAD = 2e-3
 """Arms whose joints go on by less than this stand."""
-PROBE_RAD = 0.01
-"""First bit of the way to a goal: the joint that moves furthest."""
 
 
 class PartSpacing:

@@ -22,7 +22,7 @@ from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, Ob
 from vla_zenoh.policy.options import number, one_of, yes_no
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import FloatArray
-from vla_zenoh_physicalai import link, wire
+from vla_zenoh_physicalai import wire
 from vla_zenoh_physicalai.layout import Layout, Unit
 
 GRIPPER = "gripper"
@@ -83,6 +83,9 @@ class PhysicalAiClient:
 
     def load(self) -> None:
         """Listen as the owner of the robot, on this computer alone."""
+        from vla_zenoh_physicalai import link  # zenoh, which a check of models does not need
+
+        self._newest = link.newest
         where = wire.local_endpoint(self._name)
         try:
             session = self._session = link.open_session("peer", listen=where)
@@ -139,7 +142,7 @@ class PhysicalAiClient:
         """Keep the newest action, unless it is wrong."""
         now_s = time.monotonic()
         try:
-            payload = link.newest(self._actions)
+            payload = self._newest(self._actions)
             if payload is None:
                 return
             vector, sent_s = wire.decode_action(payload, self._layout.count)
