@@ -576,10 +576,14 @@ WIDTHS = """\
 """
 
 
+@pytest.mark.parametrize(
+    ("wrench_yaml", "force_n"),
+    [("topic: /wrench", -9.0), ("topic: /wrench, exerted_by: arm", 9.0)],
+)
 def test_a_wrench_is_taken_in_the_base_frame_and_the_gripper_may_take_widths(
-    tmp_path: Path,
+    tmp_path: Path, wrench_yaml: str, force_n: float
 ) -> None:
-    with ros2_rig(tmp_path, more=WIDTHS) as rig:
+    with ros2_rig(tmp_path, more=WIDTHS.replace("topic: /wrench", wrench_yaml)) as rig:
         peer = rig.peer
         force = peer.message("geometry_msgs/msg/Vector3", z=-9.0)
         wrench = peer.message("geometry_msgs/msg/Wrench", force=force)
@@ -599,7 +603,7 @@ def test_a_wrench_is_taken_in_the_base_frame_and_the_gripper_may_take_widths(
         rig.wait("a pose with a wrench", send)
         pose: PoseState = rig.newest(PoseState)
         assert pose.wrench is not None
-        assert pose.wrench.tolist() == [0, 0, -9, 0, 0, 0]
+        assert pose.wrench.tolist() == [0, 0, force_n, 0, 0, 0]
         rig.wait("the other frame is refused", lambda: rig.counted("refused.frame"))
         widths: list[float] = []
         peer.on("/width", "std_msgs/msg/Float64", lambda message: widths.append(message.data))

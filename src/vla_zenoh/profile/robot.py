@@ -263,10 +263,13 @@ class Ros2Wrench(Section):
     Args:
         topic: its name.
         frame: required frame_id; its axes are those of robot.base_frame. None: that frame.
+        exerted_by: ``surroundings``, on the arm; or ``arm``, on them, as Franka's
+            `O_F_ext_hat_K`, whose sign is turned.
     """
 
     topic: Topic
     frame: Word | None = None
+    exerted_by: Literal["surroundings", "arm"] = "surroundings"
 
 
 class Ros2Gripper(Section):

@@ -322,6 +322,7 @@ class StateSubscriber:
         if self._wrenches is None or self._ros2.wrench is None:
             return
         frame = self._ros2.wrench.frame or self._base
+        sign = -1.0 if self._ros2.wrench.exerted_by == "arm" else 1.0
         for arrival in self._wrenches.drain():
             try:
                 found: Wrench = self._decode(WRENCH, arrival)
@@ -334,4 +335,4 @@ class StateSubscriber:
             else:
                 arrived_ns = self._node.clock.wall_at(arrival.mono_ns)
                 stamp_ns = wall_stamp_ns(found.stamp_ns, arrived_ns, self.simulated)
-                self._wrench = found._replace(stamp_ns=stamp_ns)
+                self._wrench = Wrench(stamp_ns, frame, sign * found.wrench)
