@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -184,6 +184,13 @@ def worker(
         float,
         typer.Option("--delay", min=0, max=60_000, help="Milliseconds added to every inference."),
     ] = 0.0,
+    images: Annotated[
+        Literal["raw", "jpeg"] | None,
+        typer.Option(
+            "--images",
+            help="Which images to subscribe to; default: raw, where the cameras' node is on HOST.",
+        ),
+    ] = None,
     host: HostOption = None,
 ) -> None:
     """Run a model: observations in, action chunks out on its delta key."""
@@ -197,6 +204,7 @@ def worker(
     # Returns only if this environment has what the model's header asks for.
     run_in_own_environment(chosen.model, model_options.python)
     own = None if host is None else profile.hosts.get(host)
+    nearby = own is None or "camera" in own.nodes
     identity = worker_node(chosen.name)
 
     def another() -> Policy:
@@ -214,7 +222,7 @@ def worker(
                 session,
                 policy,
                 chosen.name,
-                images="raw" if own is None or "camera" in own.nodes else "jpeg",
+                images=images or ("raw" if nearby else "jpeg"),
                 host=host,
                 delay_s=delay_ms / 1e3,
                 robots=profile.serves.get(chosen.name, ()),

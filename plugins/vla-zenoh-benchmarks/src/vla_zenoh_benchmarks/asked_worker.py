@@ -7,6 +7,7 @@ answers one observation after the other while a benchmark's clock stands still.
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -14,7 +15,7 @@ import zenoh
 from vla_zenoh.bus.buffers import CallbackRing, bytes_of
 from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.codec import records
-from vla_zenoh.codec.image import encode_raw, raw_schema
+from vla_zenoh.codec.image import encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import LOADING, Kind, worker_node
 from vla_zenoh.policy import ModelSpec
@@ -50,6 +51,7 @@ class AskedWorker:
             for part in ("joint", "pose", "gripper", "privileged")
         }
         self._cameras: dict[str, Publisher] = {}
+        self._jpegs: dict[str, Publisher] = {}
         self._chunks = node.subscribe(keys.delta(worker), CallbackRing(8))
         self._status = node.subscribe(keys.status(worker_node(worker)), CallbackRing(8))
         self._complaint, self._episode = "", time.time_ns() // 1_000_000
@@ -105,13 +107,16 @@ class AskedWorker:
                 publisher.publish(record, stamp_wall_ns=stamp_ns, seq=self._seq)
         for name, picture in seen.images.items():
             if name not in self._cameras:
-                key = self.node.keys.camera_raw(name)
-                self._cameras[name] = self.node.declare_publisher(key, Kind.FRAME)
+                keys = self.node.keys
+                self._cameras[name] = self.node.declare_publisher(keys.camera_raw(name), Kind.FRAME)
+                self._jpegs[name] = self.node.declare_publisher(keys.camera_jpeg(name), Kind.FRAME)
             image = Image(np.ascontiguousarray(picture))
+            told: dict[str, Any] = {"stamp_wall_ns": stamp_ns, "seq": self._seq}
             schema = zenoh.Encoding.ZENOH_BYTES.with_schema(raw_schema(image))
-            self._cameras[name].publish(
-                encode_raw(image), stamp_wall_ns=stamp_ns, seq=self._seq, encoding=schema
-            )
+            self._cameras[name].publish(encode_raw(image), **told, encoding=schema)
+            if self._jpegs[name].has_subscribers:  # a worker on another computer
+                jpeg = encode_jpeg(image)
+                self._jpegs[name].publish(jpeg, **told, encoding=zenoh.Encoding.IMAGE_JPEG)
         self._seq += 1
         self.node.publish_status("ready")
 

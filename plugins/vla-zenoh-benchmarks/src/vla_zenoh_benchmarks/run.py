@@ -99,7 +99,10 @@ class LocalRun:
             return self
         profile = bench_profile(stage, self._processes)
         if not stage.connect:
-            arguments = ["--python", stage.worker_python] if stage.worker_python else []
+            # The model sees what the environment drew, bit by bit.
+            arguments = ["--images", "raw"]
+            if stage.worker_python:
+                arguments += ["--python", stage.worker_python]
             nodes = running_nodes(
                 profile,
                 self._log,
