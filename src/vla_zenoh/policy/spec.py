@@ -53,7 +53,7 @@ BINARY_AWAY = 0.5
 
 STREAM_OF: Mapping[StatePart, StatePart] = {"wrench": "pose", "effort": "joint"}
 """Parts of the state that travel in the records of another one."""
-FIELD_OF: Mapping[StatePart, str] = {"effort": "effort_nm"}
+FIELD_OF: Mapping[str, str] = {"effort": "effort_nm"}
 """Parts whose field, of that record and of an `Observation`, is not called as they are."""
 
 Text = Annotated[str, Field(min_length=1, max_length=128)]

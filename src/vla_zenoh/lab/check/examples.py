@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.policy import CameraSpec, DepthSpec, ModelSpec, Observation
 from vla_zenoh.policy.observation import prepare_depth, prepare_image
-from vla_zenoh.policy.spec import FIELD_OF, StatePart
+from vla_zenoh.policy.spec import FIELD_OF
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Depth, GripperState, Image, JointState, PoseState, PrivilegedState, Task
 
@@ -176,7 +176,7 @@ class ExampleMaker:
     def _state(self, style: ExampleStyle, part: str) -> dict[str, Any]:
         """State of one arm, as far as the spec asks for it."""
         joint = self._joint(part)
-        state: dict[StatePart, Any] = {
+        state: dict[str, Any] = {
             "joint": joint,
             "pose": PoseState(np.array(style.position_m), np.array(DOWN_XYZW), np.zeros(6)),
             "gripper": GripperState(style.width_m, moving=False, holding=style.holding),
