@@ -21,6 +21,7 @@ from typing import Any
 
 RECORDED = {"sim": "state/pose", "command": "command/pose"}
 JOINTS = {"sim": "state/joint", "command": "command/joint"}
+APPENDING = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 
 
 def _note_commands(heard_s: list[float]) -> None:
@@ -51,9 +52,19 @@ def _note_states(heard_s: list[float]) -> None:
     CommandInputs.poll = take_and_note
 
 
-def _record(publisher: Any, record: Any) -> Any:
-    """What was published, also where its publisher had encoded it before."""
-    return publisher._encoded[0] if isinstance(record, bytes) else record
+def _record(key: str, published: Any) -> Any:
+    """The record that was published on `key`, which may have been encoded before."""
+    from vla_zenoh import types
+    from vla_zenoh.codec import records
+
+    kinds = {
+        "state/pose": types.PoseState,
+        "command/pose": types.PoseCommand,
+        "state/joint": types.JointState,
+        "command/joint": types.JointCommand,
+    }
+    kind = kinds["/".join(key.split("/")[-2:])]
+    return records.decode(kind, published) if isinstance(published, bytes) else published
 
 
 def _install(node: str, path: str) -> None:
@@ -64,12 +75,12 @@ def _install(node: str, path: str) -> None:
     key_end, heard_s = RECORDED[node], [float("nan")]
     (_note_commands if node == "sim" else _note_states)(heard_s)
     put = Publisher.publish
-    file = open(path, "ab", buffering=0)  # noqa: SIM115  # as long as the process lives
+    file = os.open(path, APPENDING)  # as long as the process lives
 
     def put_and_keep(self: Publisher, record: Any, **named: Any) -> Any:
         header = put(self, record, **named)
         if self.key.endswith(key_end):
-            record = _record(self, record)
+            record = _record(self.key, record)
             if key_end == RECORDED["sim"]:
                 reference = record.reference_position_m
                 parts, asked_ns = (record.position_m, record.twist, reference), None
@@ -83,7 +94,7 @@ def _install(node: str, path: str) -> None:
             )
             # By its age: a clock that is set in between does not make it older.
             silent_s = time.monotonic() - heard_s[0]
-            file.write(np.concatenate([[at_s], *parts, [asked_s, at_s - silent_s]]).tobytes())
+            os.write(file, np.concatenate([[at_s], *parts, [asked_s, at_s - silent_s]]).tobytes())
         return header
 
     Publisher.publish = put_and_keep
@@ -104,8 +115,8 @@ def _install_parts(node: str, folder: Path, parts: list[str]) -> None:
     put, nowhere = Publisher.publish, _Nowhere()
 
     @cache
-    def file_of(part: str) -> Any:
-        return (folder / f"{part}.{node}.joints").open("ab", buffering=0)
+    def file_of(part: str) -> int:
+        return os.open(folder / f"{part}.{node}.joints", APPENDING)
 
     def lost(key: str) -> bool:
         try:
@@ -123,9 +134,9 @@ def _install_parts(node: str, folder: Path, parts: list[str]) -> None:
             self._publisher = publisher
         if self.key.endswith(JOINTS[node]) and (part := self.key.split("/")[-3]) in parts:
             at_s = (header.stamp_wall_ns - self._clock.offset_ns) / 1e9
-            joints = _record(self, record)
+            joints = _record(self.key, record)
             row = [[at_s], joints.position_rad, joints.velocity_rad_s]
-            file_of(part).write(np.concatenate(row).tobytes())
+            os.write(file_of(part), np.concatenate(row).tobytes())
         return header
 
     Publisher.publish = put_and_keep
