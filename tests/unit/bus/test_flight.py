@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from vla_zenoh.keys import Kind
 
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.node import Publisher, publish_together
 from vla_zenoh.guard.stream_guard import CommandStream
+from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.command.inputs import CommandInputs
 from vla_zenoh.types import JointCommand, JointState, PoseCommand, PoseState
 
