@@ -74,6 +74,7 @@ class Reacher:
             observation=ObservationSpec(state=("pose", "privileged")),
             action=ActionSpec(**{**action, **changes}),  # pyright: ignore[reportArgumentType]
         )
+        self.worker = "reacher"
         self.asked: list[BenchmarkObservation] = []
         self.prompts: list[str] = []
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.verdict import FACT
 
 ARM_AND_GRIPPER = [0, 1, 2, 6]
 """Columns of an expert's step without its rotation."""
+_TOLD = re.compile(r"epch:(\S+) .*?l1_loss:(\S+)")
 FIGURES = ("min", "max", "mean", "std")
 
 
@@ -65,3 +68,15 @@ def mean_action(dataset: Path) -> list[float]:
     """The mean of a data set's actions."""
     told = json.loads((dataset / "meta" / "stats.json").read_text("utf-8"))
     return told["action"]["mean"]
+
+
+def led_frames(dataset: Path) -> int:
+    """Frames of a data set that another worker led than the policy."""
+    files = sorted((dataset / "data").rglob("*.parquet"))
+    return sum(sum(pq.read_table(file)["intervention"].to_pylist()) for file in files)
+
+
+def losses(log: Path) -> list[tuple[float, float]]:
+    """Epoch and mean L1 of normalized actions, as ``lerobot-train`` tells them."""
+    found = _TOLD.findall(log.read_text("utf-8", "replace"))
+    return [(float(epoch), float(loss)) for epoch, loss in found]

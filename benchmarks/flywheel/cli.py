@@ -19,8 +19,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from vla_zenoh_benchmarks.cli_compare import B_IS_WORSE
 
-from benchmarks.flywheel.cells import compare_cells, mean_action, statistics_differ
+from benchmarks.flywheel.cells import (
+    compare_cells,
+    led_frames,
+    losses,
+    mean_action,
+    statistics_differ,
+)
+from benchmarks.flywheel.figures import write_figures
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.errors import NodeError, ResourceError
 from vla_zenoh.lab.cli.output import print_json
@@ -40,7 +48,7 @@ REQUIREMENTS = (
 PACKAGES = (".", *(f"plugins/vla-zenoh-{name}" for name in ("policy-servers", "benchmarks")))
 PYTHON = "3.12"
 CAMERA, SIZE = "front", 96
-FIRST_UNSEEN = 1000
+FIRST_UNSEEN, FIRST_CORRECTED = 1000, 2000
 """Demonstrations have the seeds from 0 on."""
 BATCH = 10
 """Episodes of one call of ``lerobot-eval``, which does not resume."""
@@ -48,6 +56,9 @@ CHUNK, REPLAN = 80, 20
 """Steps that the policy plans, a second, and those of them that are carried out where it is on
 time."""
 DELAYS_MS = (0, 100, 200, 400)
+ACT, LAST = "act", "checkpoints/last/pretrained_model"
+CORRECTED_DATA = "corrected-dataset"
+CELL = ("success", "steps", "end", "taken_over_at")
 WAYS = {
     "stand": ("--mode", "live"),
     "replace": ("--mode", "command", "--composition", "replace"),
@@ -62,10 +73,15 @@ POLICY = {
     "dim_model": "128",
     "dim_feedforward": "512",
     "pretrained_backbone_weights": "null",
+    "use_vae": "false",
     "optimizer_lr": "1e-4",
     "optimizer_lr_backbone": "1e-4",
 }
-"""A small ACT, and nothing that LeRobot would fetch from a hub."""
+"""A small ACT, and nothing that LeRobot would fetch from a hub.
+
+The expert's motion is a function of what it sees: there is no style that a VAE would tell apart,
+and its encoder is half the time of a step.
+"""
 
 
 @dataclass
@@ -81,6 +97,7 @@ class Flywheel:
     delays_ms: Sequence[int]
     save_every: int
     train: Sequence[str]
+    more_steps: int
     rows: dict[str, Any] = field(default_factory=dict)
 
     def row(self, name: str, do: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -103,38 +120,77 @@ class Flywheel:
         return self._run_bench([*words, "--record", CAMERA], "demonstrations")
 
     def export(self) -> dict[str, Any]:
+        recordings = self.folder / "demonstrations" / "recordings"
+        found = self._export(self.dataset)
+        return {**found, "statistics_differ_by": statistics_differ(recordings, self.dataset)}
+
+    def _export(self, dataset: Path, more: Sequence[Path] = ()) -> dict[str, Any]:
+        """A data set of all demonstrations, and of `more` recordings."""
         words = ["dataset", "export", str(self.folder / "demonstrations" / "recordings")]
-        words += ["-o", str(self.dataset), "--camera", CAMERA, "--label", "success", "--force"]
-        command = self._vla_zenoh([*words, "--state", "position+gripper_open", "--no-rotation"])
-        info = json.loads((self.dataset / "meta" / "info.json").read_text("utf-8"))
-        return {
-            "command": command,
-            "episodes": info["total_episodes"],
-            "frames": info["total_frames"],
-            "statistics_differ_by": statistics_differ(
-                self.folder / "demonstrations" / "recordings", self.dataset
-            ),
-        }
+        words += [*map(str, more), "-o", str(dataset), "--camera", CAMERA, "--label", "success"]
+        words += ["--state", "position+gripper_open", "--no-rotation", "--force"]
+        command = self._vla_zenoh(words)
+        info = json.loads((dataset / "meta" / "info.json").read_text("utf-8"))
+        counts = {"episodes": info["total_episodes"], "frames": info["total_frames"]}
+        return {"command": command, **counts, "led_by_the_expert": led_frames(dataset)}
 
     def training(self) -> dict[str, Any]:
-        output = self.folder / "act"
-        last = output / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-        if last.exists():
-            words = ["--resume=true", f"--config_path={last}"]
+        policy = [f"--policy.{name}={value}" for name, value in POLICY.items()]
+        return self._train(ACT, self.dataset, policy, self.steps)
+
+    def train_on(self, name: str, dataset: Path) -> dict[str, Any]:
+        """Go on with the trained policy on a data set, with a new optimizer."""
+        policy = [f"--policy.path={self.folder / ACT / LAST}", "--policy.push_to_hub=false"]
+        return self._train(name, dataset, policy, self.more_steps)
+
+    def _train(self, name: str, dataset: Path, policy: Sequence[str], steps: int) -> dict[str, Any]:
+        output = self.folder / name
+        if (output / LAST / "train_config.json").exists():
+            words = ["--resume=true", f"--config_path={output / LAST / 'train_config.json'}"]
         else:
             shutil.rmtree(output, ignore_errors=True)  # LeRobot rejects a folder that is there
-            words = [f"--dataset.repo_id=local/{self.task}", f"--dataset.root={self.dataset}"]
-            words += [f"--policy.{name}={value}" for name, value in POLICY.items()]
-            words += [f"--output_dir={output}", "--env_eval_freq=0", "--batch_size=16"]
-            words += ["--num_workers=1", "--log_freq=50", f"--save_freq={self.save_every}"]
-        words += [f"--steps={self.steps}", *(f"--{each}" for each in self.train)]
-        command = self._lerobot("lerobot-train", words)
-        return {"command": command, "steps": self.steps}
+            words = [f"--dataset.repo_id=local/{self.task}", f"--dataset.root={dataset}", *policy]
+            # On two cores a process that decodes pictures costs more than it brings.
+            words += [f"--output_dir={output}", "--env_eval_freq=0", "--batch_size=8"]
+            words += ["--num_workers=0", "--log_freq=50", f"--save_freq={self.save_every}"]
+        words += [f"--steps={steps}", *(f"--{each}" for each in self.train)]
+        log = self.folder / f"{name}.log"
+        command = self._lerobot("lerobot-train", words, log)
+        return {"command": command, "steps": steps, "l1_by_epoch": losses(log)}
 
-    def policy(self, name: str, *more: str) -> dict[str, Any]:
-        words = self._bench("lerobot", FIRST_UNSEEN, self.episodes, name)
-        words += ["--set", f"checkpoint={self.folder / 'act'}", "--set", "device=cpu"]
+    def policy(self, name: str, *more: str, checkpoint: str = ACT) -> dict[str, Any]:
+        return self._policy(name, FIRST_UNSEEN, self.episodes, checkpoint, more)
+
+    def _policy(
+        self, name: str, first: int, count: int, checkpoint: str, more: Sequence[str]
+    ) -> dict[str, Any]:
+        words = self._bench("lerobot", first, count, name)
+        words += ["--set", f"checkpoint={self.folder / checkpoint}", "--set", "device=cpu"]
         return self._run_bench([*words, "--replan", str(REPLAN), *more], name)
+
+    def takeover(self) -> dict[str, Any]:
+        """The expert corrects the policy on seeds that neither training nor evaluation has."""
+        more = ("--takeover", "metaworld_expert", "--record", CAMERA)
+        return self._policy("takeover", FIRST_CORRECTED, self.demonstrations, ACT, more)
+
+    def corrected_dataset(self) -> dict[str, Any]:
+        """The demonstrations, and the episodes that were taken over."""
+        taken = [
+            self.folder / "takeover" / "recordings" / f"lerobot.{self.task}.{each['seed']}.mcap"
+            for each in self.rows["takeover"]["all"]
+            if each["taken_over_at"] is not None
+        ]
+        return self._export(self.folder / CORRECTED_DATA, taken)
+
+    def compare(self, before: str, after: str) -> dict[str, Any]:
+        """Both on the same seeds."""
+        words = ["compare", str(self.folder / before), str(self.folder / after), "--json"]
+        told = subprocess.run(
+            [sys.executable, "-m", "vla_zenoh", *words], capture_output=True, text=True, check=False
+        )
+        if told.returncode not in (0, B_IS_WORSE):
+            raise NodeError(f"{self._shown(words)}: {told.stderr.strip()}")
+        return {"command": self._shown(["vla-zenoh", *words]), **json.loads(told.stdout)}
 
     def constant(self, name: str, action: Sequence[float]) -> dict[str, Any]:
         model = str(Path(__file__).with_name("constant.py"))
@@ -149,7 +205,7 @@ class Flywheel:
     def theirs(self) -> dict[str, Any]:
         """``lerobot-eval`` on the same seeds, `BATCH` at a time."""
         out, command, cells = self.folder / "lerobot-eval", "", list[dict[str, Any]]()
-        policy = self.folder / "act" / "checkpoints" / "last" / "pretrained_model"
+        policy = self.folder / ACT / LAST
         for first in range(FIRST_UNSEEN, FIRST_UNSEEN + self.episodes, BATCH):
             count = min(BATCH, FIRST_UNSEEN + self.episodes - first)
             folder = out / str(first)
@@ -164,7 +220,7 @@ class Flywheel:
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir(parents=True)
                 self._lerobot("lerobot-eval", words)
-            command = command or _shown(["lerobot-eval", *words])
+            command = command or self._shown(["lerobot-eval", *words])
             cells += _cells(folder)
         return {"command": command, "all": cells, "successes": sum(c["success"] for c in cells)}
 
@@ -186,7 +242,7 @@ class Flywheel:
         result = json.loads((self.folder / name / "result.json").read_text("utf-8"))
         kept = ("episodes", "successes", "success_rate", "wilson_95", "steps_to_success_p50")
         cells = [
-            {"seed": each["episode"], **{k: each[k] for k in ("success", "steps", "end")}}
+            {"seed": each["episode"], **{k: each[k] for k in CELL if each[k] is not None}}
             for each in result["all"]
         ]
         more = {k: result[k] for k in ("mode", "delay_ms", "composition", "versions")}
@@ -194,12 +250,17 @@ class Flywheel:
 
     def _vla_zenoh(self, words: Sequence[str]) -> str:
         _call([sys.executable, "-m", "vla_zenoh", *words], {})
-        return _shown(["vla-zenoh", *words])
+        return self._shown(["vla-zenoh", *words])
 
-    def _lerobot(self, program: str, words: Sequence[str]) -> str:
+    def _lerobot(self, program: str, words: Sequence[str], log: Path | None = None) -> str:
         offline = {"HF_HUB_OFFLINE": "1", "MUJOCO_GL": "egl", "PYTHONPATH": str(ROOT)}
-        _call([str(self.python.with_name(program)), *words], offline)
-        return _shown([program, *words])
+        _call([str(self.python.with_name(program)), *words], offline, log)
+        return self._shown([program, *words])
+
+    def _shown(self, words: Sequence[str]) -> str:
+        """A command with the names of this computer's folders left out."""
+        told = _shown(words).replace(str(self.python), "PYTHON").replace(str(self.folder), "OUTPUT")
+        return told.replace(f"{ROOT}/", "")
 
 
 def _cells(folder: Path) -> list[dict[str, Any]]:
@@ -220,13 +281,30 @@ def _cells(folder: Path) -> list[dict[str, Any]]:
     ]
 
 
-def _call(command: Sequence[str], environ: dict[str, str]) -> None:
-    # Its stdout is not ours: with --json that has the rows.
-    done = subprocess.run(
-        command, cwd=ROOT, env={**os.environ, **environ}, stdout=sys.stderr, check=False
-    )
-    if done.returncode:
-        raise NodeError(f"{_shown(command)} ended with status {done.returncode}")
+def _call(command: Sequence[str], environ: dict[str, str], log: Path | None = None) -> None:
+    """Run a command, whose output goes to stderr, and into `log` as well.
+
+    Raises:
+        NodeError: it ended with another status than 0.
+    """
+    own = {"cwd": ROOT, "env": {**os.environ, **environ}}
+    if log is None:  # its stdout is not ours: with --json that has the rows
+        status = subprocess.run(command, stdout=sys.stderr, check=False, **own).returncode
+    else:
+        with (
+            log.open("ab") as file,
+            subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **own
+            ) as process,
+        ):
+            assert process.stdout is not None
+            while told := os.read(process.stdout.fileno(), 65536):
+                file.write(told)
+                sys.stderr.buffer.write(told)
+                sys.stderr.flush()
+        status = process.returncode
+    if status:
+        raise NodeError(f"{_shown(command)} ended with status {status}")
 
 
 def _shown(command: Sequence[str]) -> str:
@@ -261,9 +339,15 @@ def flywheel(
     train: Annotated[
         list[str] | None, typer.Option("--train", help="name=value for lerobot-train; repeatable.")
     ] = None,
+    more_steps: Annotated[
+        int, typer.Option(help="Of the training after the expert's corrections.")
+    ] = 4000,
     python: Annotated[
         Path | None,
         typer.Option(help="Interpreter of a prepared environment; default: one is made."),
+    ] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder for figures of what was done, as SVG and PDF.")
     ] = None,
     until: Annotated[str, typer.Option(help="Name of the last step.")] = "",
     as_json: JsonOption = False,
@@ -274,7 +358,18 @@ def flywheel(
     found = (python or make_environment(folder / "env")).absolute()
     waits = [int(each) for each in delays.split(",") if each]
     wheel = Flywheel(
-        *(folder, found, task, demonstrations, steps, episodes, waits, save_every, train or ())
+        *(
+            folder,
+            found,
+            task,
+            demonstrations,
+            steps,
+            episodes,
+            waits,
+            save_every,
+            train or (),
+            more_steps,
+        )
     )
     plan: dict[str, Callable[[], dict[str, Any]]] = {
         "demonstrations": wheel.record,
@@ -294,12 +389,26 @@ def flywheel(
             name = f"{way}-{delay_ms}ms"
             more = (*words, "--delay", str(delay_ms), "--set", f"horizon={CHUNK}")
             plan[name] = lambda name=name, more=more: wheel.policy(name, *more)
+    plan |= {
+        "takeover": wheel.takeover,
+        "corrected-dataset": wheel.corrected_dataset,
+        "corrected-training": lambda: wheel.train_on(
+            "corrected-act", wheel.folder / CORRECTED_DATA
+        ),
+        "longer-training": lambda: wheel.train_on("longer-act", wheel.dataset),
+        "corrected": lambda: wheel.policy("corrected", checkpoint="corrected-act"),
+        "longer": lambda: wheel.policy("longer", checkpoint="longer-act"),
+        "native-to-corrected": lambda: wheel.compare("native", "corrected"),
+        "longer-to-corrected": lambda: wheel.compare("longer", "corrected"),
+    }
     if until and until not in plan:
         raise typer.BadParameter(f"--until: the steps are {', '.join(plan)}")
     for name, do in plan.items():
         wheel.row(name, do)
         if name == until:
             break
+    for file in write_figures(pictures, wheel.rows) if pictures is not None else ():
+        print(file, file=sys.stderr)
     if as_json:
         print_json(wheel.rows)
     else:

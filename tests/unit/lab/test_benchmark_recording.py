@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from benchmark_rig import DT_S, Reacher, own_benchmark, request
+from benchmark_rig import Reacher, own_benchmark, request
 from vla_zenoh_benchmarks.contract import BenchmarkObservation
 from vla_zenoh_benchmarks.episode import EpisodeConditions, EpisodeOutcome
 from vla_zenoh_benchmarks.process import run_episode
@@ -47,7 +47,7 @@ def recorded(folder: Path, episode: int = 0, steps: int = 3) -> tuple[EpisodeOut
     wanted = request("far", episode)
     path = recording_file(folder, wanted.key)
     recorder = EpisodeRecorder(
-        path, load_profile("panda_sim"), "reacher", worker.spec, [CAMERA], DT_S
+        path, load_profile("panda_sim"), "reacher", worker.spec, [CAMERA], benchmark.action
     )
     outcome = run_episode(benchmark, wanted, worker, EpisodeConditions(), recorder)
     recorder.finish(success=outcome.success, steps=outcome.steps)
@@ -98,8 +98,9 @@ def test_its_label_is_the_verdict_of_the_benchmark(tmp_path: Path) -> None:
 def test_an_episode_that_did_not_end_leaves_no_recording(tmp_path: Path) -> None:
     path = recording_file(tmp_path, "reach/far/0")
     spec = Reacher().spec
+    action = own_benchmark().action
     for _ in range(2):  # the second attempt begins anew
-        recorder = EpisodeRecorder(path, load_profile("panda_sim"), "reacher", spec, [], DT_S)
+        recorder = EpisodeRecorder(path, load_profile("panda_sim"), "reacher", spec, [], action)
         recorder.begin("go")
         recorder.abandon()
     assert not path.exists()

@@ -27,8 +27,10 @@ from vla_zenoh.errors import ResourceError, nearest
 from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import check_folder
 from vla_zenoh.lab.tasks.task import shown_camera
+from vla_zenoh.policy.loader import find_worker
 from vla_zenoh_benchmarks.contract import BenchmarkTask
 from vla_zenoh_benchmarks.episode import (
+    DISAGREEMENT,
     Composition,
     EpisodeConditions,
     EpisodeOutcome,
@@ -91,6 +93,25 @@ class BenchmarkEpisodes:
         Composition,
         typer.Option("--composition", help="Of chunks that overlap, in mode command."),
     ] = "replace"
+    takeover: Annotated[
+        str,
+        typer.Option(
+            "--takeover",
+            metavar="WORKER",
+            help="A model that watches, and leads to the end of an episode from where it "
+            "disagrees; recorded, that is an intervention.",
+        ),
+    ] = ""
+    disagreement: Annotated[
+        float,
+        typer.Option(
+            "--disagreement",
+            min=0.0,
+            max=10.0,
+            help="With --takeover: difference of both motions within 0.25 s that is too large, as "
+            "a share of the watching model's.",
+        ),
+    ] = DISAGREEMENT
 
     @property
     def conditions(self) -> EpisodeConditions:
@@ -100,7 +121,12 @@ class BenchmarkEpisodes:
             raise typer.BadParameter(
                 "--composition: only our command node has it; add --mode command"
             )
-        return EpisodeConditions(self.mode, self.delay_ms, self.replan, self.composition)
+        if self.mode != "native" and self.takeover:
+            raise typer.BadParameter(
+                "--takeover: only where the environment waits; leave out --mode"
+            )
+        own = (self.mode, self.delay_ms, self.replan, self.composition)
+        return EpisodeConditions(*own, disagreement=self.disagreement)
 
     def requests(self, about: dict[str, Any]) -> list[EpisodeRequest]:
         known = [BenchmarkTask(**task) for task in about["tasks"]]
@@ -236,11 +262,12 @@ def sim(
     name = REPLAY if replay else chosen.name if chosen else worker or ""
     if not name and not list_tasks:
         raise typer.BadParameter("give --worker NAME, --replay DIR or --list")
+    conditions, teacher = episodes.conditions, _teacher(episodes.takeover, name, place, replay)
     setting = BenchmarkSetting(
         benchmark,
         model_options(benchmark_settings or []),
         worker="" if replay or list_tasks else name,
-        conditions=episodes.conditions,
+        conditions=replace(conditions, takeover=teacher[0]),
     )
     if output.output is not None:
         check_folder(output.output, begun=(output.output / PLAN).exists())
@@ -248,6 +275,7 @@ def sim(
         setting,
         tuple(model.settings or ()),
         str(chosen.model.path) if chosen else "",
+        teacher[1],
         model.python,
         place.benchmark_python,
         place.connect or "",
@@ -307,6 +335,18 @@ def sim(
             write_page(output.output, result)
     finally:
         teller.close()
+
+
+def _teacher(word: str, worker: str, place: BenchmarkPlace, replay: Path | None) -> tuple[str, str]:
+    """Name and file of the model that takes over; empty: none does."""
+    if not word:
+        return "", ""
+    if replay is not None or place.connect or place.ray is not None:
+        raise typer.BadParameter("--takeover: not with --replay, --connect or --ray")
+    name, model = find_worker(word, {})
+    if name == worker:
+        raise typer.BadParameter(f"--takeover: {name} leads already; name another model")
+    return name, str(model.path)
 
 
 def _run(

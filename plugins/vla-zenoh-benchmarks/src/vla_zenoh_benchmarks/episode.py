@@ -22,6 +22,7 @@ from vla_zenoh_benchmarks.contract import (
 
 Mode = Literal["native", "live", "command"]
 Composition = Literal["replace", "blend", "ensemble"]
+DISAGREEMENT = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +36,16 @@ class EpisodeConditions:
         delay_ms: what an inference takes on the environment's clock; None: what it took.
         replan: steps to carry out of each chunk; 0: all.
         composition: of chunks that overlap, in mode ``command``: `composition.mode` of a profile.
+        takeover: worker that leads from where it disagrees, in mode ``native``; empty: none.
+        disagreement: see `Takeover`.
     """
 
     mode: Mode = "native"
     delay_ms: float | None = None
     replan: int = 0
     composition: Composition = "replace"
+    takeover: str = ""
+    disagreement: float = DISAGREEMENT
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +71,7 @@ class EpisodeOutcome:
         end: hash of the simulation's state after the last step, empty: it does not tell.
         failure: empty, ``steps`` (the limit) or what the command node stopped for.
         attempts: how often it was begun; those before were lost with their process.
+        taken_over_at: number of steps before another worker took over; None: none did.
     """
 
     suite: str
@@ -79,6 +85,7 @@ class EpisodeOutcome:
     end: str = ""
     failure: str = ""
     attempts: int = 1
+    taken_over_at: int | None = None
     actions: list[FloatArray] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
@@ -89,6 +96,7 @@ class Asked(Protocol):
     """Whom an episode asks for chunks, see `AskedWorker`."""
 
     spec: ModelSpec
+    worker: str
 
     def begin(self, prompt: str) -> None: ...
 
@@ -102,11 +110,13 @@ class Recorder(Protocol):
 
     def begin(self, prompt: str) -> None: ...
 
+    def taken_over(self, worker: str, spec: ModelSpec, step: int) -> None: ...
+
     def chunk(self, chunk: ActionChunk, step: int) -> None: ...
 
     def saw(self, seen: BenchmarkObservation, step: int) -> None: ...
 
-    def moved(self, seen: BenchmarkObservation, step: int) -> None: ...
+    def moved(self, seen: BenchmarkObservation, action: FloatArray, step: int) -> None: ...
 
 
 class EpisodeClock:
@@ -140,10 +150,20 @@ class EpisodeClock:
         began_s = time.perf_counter()
         chunk = self.worker.ask(self.benchmark.observe(self.cameras))
         self._asked_ms.append((time.perf_counter() - began_s) * 1e3)
+        self.heard(chunk)
+        return chunk.steps
+
+    def heard(self, chunk: ActionChunk) -> None:
+        """A chunk came for what is to see now."""
         self.outcome.chunks += 1
         if self.recorder is not None:
             self.recorder.chunk(chunk, self.outcome.steps)
-        return chunk.steps
+
+    def taken_over_by(self, teacher: Asked) -> None:
+        """From here on another worker leads."""
+        self.outcome.taken_over_at = self.outcome.steps
+        if self.recorder is not None:
+            self.recorder.taken_over(teacher.worker, teacher.spec, self.outcome.steps)
 
     @property
     def asked_s(self) -> float:
@@ -160,7 +180,7 @@ class EpisodeClock:
             self.recorder.saw(seen, self.outcome.steps)
         self.outcome.success = bool(self.benchmark.step(action))
         if self.recorder is not None:
-            self.recorder.moved(self.benchmark.observe([]), self.outcome.steps)
+            self.recorder.moved(self.benchmark.observe([]), action, self.outcome.steps)
         self.outcome.steps += 1
         self.outcome.actions.append(np.array(action))
 

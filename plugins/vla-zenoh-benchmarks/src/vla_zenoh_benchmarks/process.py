@@ -26,6 +26,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
 from vla_zenoh.plugins import how_to_repeat
+from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import ModelFile, find_model
 from vla_zenoh.profile import as_robot, load_profile
 from vla_zenoh.resources import BENCHMARKS
@@ -43,12 +44,18 @@ from vla_zenoh_benchmarks.episode import (
     Recorder,
     state_hash,
 )
+from vla_zenoh_benchmarks.takeover import Takeover
 
 EXTRAS = {"control": "ruckig", "record": "mcap"}
 """Extra of this package -> one of its packages."""
 ANSWER_PATIENCE_S = 300.0
 FRAME_HZ = 10
 LAST_LINES = 20
+
+
+def teachers_robot(robot: str) -> str:
+    """In whose keys a teacher is asked: two writers of one robot's state would be one too many."""
+    return f"{robot}_teacher"
 
 
 class BenchmarkLost(NodeError):
@@ -206,11 +213,13 @@ def run_episode(
     worker: Asked,
     conditions: EpisodeConditions,
     recorder: Recorder | None = None,
+    takeover: Takeover | None = None,
 ) -> EpisodeOutcome:
     """Run an episode; the model is asked by `worker`.
 
     Args:
         recorder: who keeps every step; None: nobody.
+        takeover: who leads from where it disagrees; None: nobody.
 
     Raises:
         NodeError: the worker does not answer.
@@ -222,6 +231,8 @@ def run_episode(
     clock = EpisodeClock(benchmark, request, worker, recorder)
     if recorder is not None:
         recorder.begin(request.task.prompt)
+    if takeover is not None:
+        takeover.begin(clock)
     if conditions.mode == "command":
         from vla_zenoh_benchmarks.command_path import run_through_command_node
 
@@ -235,6 +246,8 @@ def run_episode(
             delay_s = clock.asked_s if given_s is None else given_s
             clock.stand(math.ceil(round(delay_s / benchmark.action.dt_s, 6)))
         for action in steps[: conditions.replan or None]:
+            if takeover is not None and not clock.over and takeover.disagrees(clock, action):
+                takeover.lead(clock)
             clock.step(action)
     return clock.finish(began_s)
 
@@ -270,6 +283,7 @@ class _Child:
         self._setting = BenchmarkSetting(conditions=conditions, **given)
         self.benchmark: Benchmark = make_benchmark(self._setting.file, self._setting.options)
         self._worker: AskedWorker | None = None
+        self._takeover: Takeover | None = None
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         do = request.pop("do")
@@ -295,9 +309,10 @@ class _Child:
         return {**found.to_dict(), "actions": actions}
 
     def _run(self, wanted: EpisodeRequest) -> EpisodeOutcome:
-        worker, setting = self._asked(), self._setting
+        worker, takeover, setting = self._asked(), self._takeover, self._setting
+        conditions = setting.conditions
         if not setting.record:
-            return run_episode(self.benchmark, wanted, worker, setting.conditions)
+            return run_episode(self.benchmark, wanted, worker, conditions, None, takeover)
         from vla_zenoh_benchmarks.recorded import EpisodeRecorder, recording_file
 
         recorder = EpisodeRecorder(
@@ -306,10 +321,10 @@ class _Child:
             setting.worker,
             worker.spec,
             setting.record,
-            self.benchmark.action.dt_s,
+            self.benchmark.action,
         )
         try:
-            found = run_episode(self.benchmark, wanted, worker, setting.conditions, recorder)
+            found = run_episode(self.benchmark, wanted, worker, conditions, recorder, takeover)
             recorder.finish(success=found.success, steps=found.steps)
         except BaseException:
             recorder.abandon()
@@ -321,22 +336,29 @@ class _Child:
             profile = as_robot(load_profile(self._setting.profile_file), self._robot)
             self._profile = profile
             session = open_session(profile.session, wait_s=10.0)
-            name = self._setting.worker
+            name, conditions = self._setting.worker, self._setting.conditions
             self._worker = AskedWorker(profile, session, name, ANSWER_PATIENCE_S)
-            known = self.benchmark.cameras
-            wanted = [one.camera for one in self._worker.spec.observation.cameras]
-            if missing := [each for each in wanted if each not in known]:
-                raise WorkerError(
-                    f"model {self._worker.spec.name!r} needs the cameras {', '.join(missing)}; "
-                    f"the benchmark has: {', '.join(known)}"
-                )
-            looks = self._worker.spec.observation
-            if looks.depth or looks.history > 1:
-                raise WorkerError(
-                    f"model {self._worker.spec.name!r} needs "
-                    f"{'depth' if looks.depth else 'a history'}, which no benchmark gives"
-                )
+            self._require_seen(self._worker.spec)
+            if conditions.takeover:
+                beside = as_robot(profile, teachers_robot(self._robot))
+                teacher = AskedWorker(beside, session, conditions.takeover, ANSWER_PATIENCE_S)
+                self._require_seen(teacher.spec)
+                self._takeover = Takeover(teacher, conditions.disagreement)
         return self._worker
+
+    def _require_seen(self, spec: ModelSpec) -> None:
+        """Raises WorkerError: a model needs what the benchmark does not show."""
+        known, looks = self.benchmark.cameras, spec.observation
+        if missing := [one.camera for one in looks.cameras if one.camera not in known]:
+            raise WorkerError(
+                f"model {spec.name!r} needs the cameras {', '.join(missing)}; "
+                f"the benchmark has: {', '.join(known)}"
+            )
+        if looks.depth or looks.history > 1:
+            raise WorkerError(
+                f"model {spec.name!r} needs {'depth' if looks.depth else 'a history'}, which no "
+                "benchmark gives"
+            )
 
     def _describe(self, suite: str | None) -> dict[str, Any]:
         found = self.benchmark

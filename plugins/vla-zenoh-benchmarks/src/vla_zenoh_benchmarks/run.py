@@ -17,7 +17,12 @@ from vla_zenoh.lab.cli.running_nodes import running_nodes
 from vla_zenoh.profile import load_profile, override, to_yaml
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh_benchmarks.episode import EpisodeOutcome, EpisodeRequest
-from vla_zenoh_benchmarks.process import BenchmarkLost, BenchmarkProcess, BenchmarkSetting
+from vla_zenoh_benchmarks.process import (
+    BenchmarkLost,
+    BenchmarkProcess,
+    BenchmarkSetting,
+    teachers_robot,
+)
 
 ATTEMPTS = 3
 POLL_S = 0.2
@@ -38,6 +43,7 @@ class BenchmarkStage:
 
     Args:
         worker_options: ``name=value`` of the model.
+        teacher_model: file of the worker that takes over.
         connect: endpoint of a router with a worker that runs already; empty: both are started.
         max_width_m: of the benchmark's gripper; None: it does not tell.
     """
@@ -45,6 +51,7 @@ class BenchmarkStage:
     setting: BenchmarkSetting
     worker_options: tuple[str, ...] = ()
     worker_model: str = ""
+    teacher_model: str = ""
     worker_python: str | None = None
     benchmark_python: str | None = None
     connect: str = ""
@@ -57,8 +64,14 @@ def robots(processes: int) -> list[str]:
 
 
 def bench_profile(stage: BenchmarkStage, processes: int) -> Profile:
-    """The profile of the robots of a run: no arm, a router and one worker."""
-    worker = stage.setting.worker
+    """The profile of the robots of a run: no arm, a router and its workers."""
+    worker, teacher = stage.setting.worker, stage.setting.conditions.takeover
+    names = robots(processes)
+    serves = {worker: names}
+    models = {worker: stage.worker_model} if stage.worker_model else {}
+    if teacher:
+        serves[teacher] = [*names, *map(teachers_robot, names)]
+        models[teacher] = stage.teacher_model
     base = load_profile("panda_sim")
     width_m = stage.max_width_m
     gripper = {} if width_m is None else {"gripper": {"max_width_m": width_m}}
@@ -66,11 +79,11 @@ def bench_profile(stage: BenchmarkStage, processes: int) -> Profile:
         base,
         {
             "name": "benchmark",
-            "robot": {"name": robots(processes)[0], **gripper},
+            "robot": {"name": names[0], **gripper},
             "cameras": dict.fromkeys(base.cameras),
-            "workers": [worker],
-            "models": {worker: stage.worker_model} if stage.worker_model else {},
-            "serves": {worker: robots(processes)},
+            "workers": list(serves),
+            "models": models,
+            "serves": serves,
             "task": {"worker": worker},
             "hosts": {"here": {"nodes": ["router", "worker"]}},
         },
