@@ -97,6 +97,7 @@ class Flywheel:
     delays_ms: Sequence[int]
     save_every: int
     train: Sequence[str]
+    corrections: int
     more_steps: int
     rows: dict[str, Any] = field(default_factory=dict)
 
@@ -171,7 +172,7 @@ class Flywheel:
     def takeover(self) -> dict[str, Any]:
         """The expert corrects the policy on seeds that neither training nor evaluation has."""
         more = ("--takeover", "metaworld_expert", "--record", CAMERA)
-        return self._policy("takeover", FIRST_CORRECTED, self.demonstrations, ACT, more)
+        return self._policy("takeover", FIRST_CORRECTED, self.corrections, ACT, more)
 
     def corrected_dataset(self) -> dict[str, Any]:
         """The demonstrations, and the episodes that were taken over."""
@@ -330,7 +331,7 @@ def flywheel(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder; goes on there.")],
     task: Annotated[str, typer.Option(help="Of Meta-World.")] = "drawer-open-v3",
     demonstrations: Annotated[int, typer.Option(help="Of the expert, seeds from 0.")] = 50,
-    steps: Annotated[int, typer.Option(help="Of the training.")] = 12_000,
+    steps: Annotated[int, typer.Option(help="Of the training.")] = 6000,
     episodes: Annotated[int, typer.Option(help="Unseen seeds, from 1000.")] = 50,
     delays: Annotated[str, typer.Option(help="Of an inference, ms; empty: none.")] = ",".join(
         map(str, DELAYS_MS)
@@ -339,9 +340,12 @@ def flywheel(
     train: Annotated[
         list[str] | None, typer.Option("--train", help="name=value for lerobot-train; repeatable.")
     ] = None,
+    corrections: Annotated[
+        int, typer.Option(help="Seeds from 2000 that the expert watches, and takes over.")
+    ] = 50,
     more_steps: Annotated[
         int, typer.Option(help="Of the training after the expert's corrections.")
-    ] = 4000,
+    ] = 2000,
     python: Annotated[
         Path | None,
         typer.Option(help="Interpreter of a prepared environment; default: one is made."),
@@ -357,20 +361,8 @@ def flywheel(
     folder.mkdir(parents=True, exist_ok=True)
     found = (python or make_environment(folder / "env")).absolute()
     waits = [int(each) for each in delays.split(",") if each]
-    wheel = Flywheel(
-        *(
-            folder,
-            found,
-            task,
-            demonstrations,
-            steps,
-            episodes,
-            waits,
-            save_every,
-            train or (),
-            more_steps,
-        )
-    )
+    sizes = (demonstrations, steps, episodes, waits, save_every, train or ())
+    wheel = Flywheel(folder, found, task, *sizes, corrections, more_steps)
     plan: dict[str, Callable[[], dict[str, Any]]] = {
         "demonstrations": wheel.record,
         "dataset": wheel.export,
