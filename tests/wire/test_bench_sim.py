@@ -113,3 +113,21 @@ def environments(parent: int) -> list[int]:
             if int(stat[1]) == parent and b"vla_zenoh_benchmarks.process" in said:
                 out.append(int(each.name))
     return sorted(out) if len(out) == 3 else []
+
+
+def test_another_model_takes_over_where_it_disagrees_and_that_is_recorded(
+    tmp_path: Path, model: Path
+) -> None:
+    astray = tmp_path / "astray.py"
+    astray.write_text(REACHER.replace("np.clip(", "-np.clip("), "utf-8")
+    out = tmp_path / "run"
+    taken = ("--takeover", str(model), "-n", "1", "--tasks", "far", "-o", str(out))
+    done = command_line(*words(astray, *taken), timeout_s=TIMEOUT_S)
+    assert done.returncode == 0, done.stderr
+    (episode,) = result(out)["all"]
+    assert episode["success"]
+    assert episode["taken_over_at"] == 4
+    assert result(out)["takeover"] == "reacher"
+    itself = command_line(*words(model, "--takeover", str(model), "-n", "1"), timeout_s=TIMEOUT_S)
+    assert itself.returncode == 2
+    assert "reacher leads already" in itself.stderr
