@@ -51,8 +51,8 @@ def site(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Itera
 class Tab:
     """A tab of Chromium with the page open."""
 
-    KEY_LEFT = "\ue012"
-    """The left arrow, in WebDriver's code."""
+    KEY_LEFT, ENTER = "\ue012", "\ue007"
+    """Keys in WebDriver's code."""
 
     def __init__(self, driver: Any, site: Site) -> None:
         self.driver = driver
@@ -181,10 +181,119 @@ def test_the_arm_moves_while_the_button_is_held_and_the_page_says_who_holds(
     tab.until("it is active", held, 60.0)
     chain.until("it moves", chain.moves)
     tab.until("the page has it", lambda: "held byyou" in tab.text("facts"))
-    assert not tab.run("return document.getElementById('activate').classList.contains('next')")
+    assert tab.text("do") == "Let go to brake."
     tab.let_go()
     chain.wait_still()
     tab.until("nobody has it", lambda: "held bynobody" in tab.text("facts"))
+
+
+def test_holding_is_the_most_prominent_way_to_run(tab: Tab) -> None:
+    def colour(name: str) -> str:
+        return tab.run(f"return getComputedStyle({name}).backgroundColor")
+
+    accent = colour("document.querySelector('button[aria-pressed=true]:not(.picture)')")
+    hold = "document.getElementById('hold')"
+    assert colour(hold) == accent
+    assert colour("document.getElementById('activate')") != accent
+    first = tab.run("return [...document.querySelectorAll('button')].slice(0, 3).map((b) => b.id)")
+    assert {"hold", "stop"} <= {*first}
+
+
+def test_a_touch_enlarges_a_picture_and_leaves_stop_in_reach(tab: Tab) -> None:
+    tab.until("a picture", lambda: tab.run("return shown.has('camera/front')"))
+    small = tab.run("return shown.get('camera/front').canvas.clientWidth")
+    tab.click("picture of front, large")
+    assert tab.run("return shown.get('camera/front').canvas.clientWidth") > 2 * small
+    above = (
+        "const b = document.getElementById('stop').getBoundingClientRect();"
+        "return document.elementFromPoint(b.x + b.width / 2, b.y + b.height / 2).id"
+    )
+    assert tab.run(above) == "stop"
+    tab.button("picture of front, large").send_keys(tab.ENTER)
+    assert tab.run("return shown.get('camera/front').canvas.clientWidth") == small
+
+
+def test_the_last_minute_is_told_in_words_and_drawn(chain: Chain, tab: Tab) -> None:
+    def captions() -> list[str]:
+        return tab.run(
+            "return [...document.querySelectorAll('#lines figcaption')].map((c) => c.textContent)"
+        )
+
+    tab.until("a speed", lambda: " cm/s; at most " in captions()[0])
+    assert captions()[3].startswith("limits: ")
+    painted = (
+        "const c = document.querySelector('#lines canvas');"
+        "return c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some((v) => v)"
+    )
+    tab.until("a line", lambda: tab.run(painted))
+
+
+def test_a_stop_buzzes_says_when_the_arm_stood_and_offers_the_reset(chain: Chain, tab: Tab) -> None:
+    tab.run(
+        "window.felt = []; navigator.vibrate = (pattern) => { felt.push(pattern); return true; }"
+    )
+    tab.press("STOP")
+    tab.let_go()
+    tab.until("when it stood", lambda: "stood at" in tab.text("stop-words"))
+    assert len(tab.run("return felt")) == 2
+    tab.until("the banner", lambda: tab.text("what") == "Emergency stop. The arm stands.")
+    tab.click("Reset")
+    tab.until("it is cleared", lambda: chain.state() == "inactive")
+    tab.until(
+        "the reset is gone", lambda: tab.run("return document.getElementById('reset').hidden")
+    )
+
+
+def test_the_page_says_who_is_here_and_lets_a_person_leave(tab: Tab) -> None:
+    tab.until("anna", lambda: "anna, operator" in tab.text("here"))
+    tab.click("Sign out")
+    assert tab.run("return document.getElementById('enter').open")
+    assert not tab.run("return sessionStorage.getItem('token')")
+    assert tab.run("return document.getElementById('hold').disabled")
+
+
+def test_a_person_is_invited_by_a_link_of_their_own(site: Site, tab: Tab) -> None:
+    tab.put("invite-name", "bob")
+    tab.run("document.getElementById('invite-role').value = 'viewer'")
+    tab.click("Invite")
+    link = tab.until(
+        "the link", lambda: tab.run("return document.getElementById('invited-link').value")
+    )
+    assert link.startswith(f"http://{site.host}/#")
+    tab.driver.switch_to.new_window("window")
+    tab.driver.get(link)
+    tab.until("bob is in", lambda: tab.text("who") == "bob, viewer")
+    tab.until("both are named", lambda: tab.text("here") == "anna, operatorbob, viewer")
+    assert tab.run("return document.getElementById('hold').disabled")
+
+
+def test_the_guide_leads_to_a_data_set(chain: Chain, tab: Tab) -> None:
+    chain.activate_when_ready()
+    tab.click("Deactivate")
+    chain.wait_still()
+    tab.put("guide-prompt", "HARD: go up" if chain.height_m() < 0.42 else chain.down)
+    tab.put("guide-count", "1")
+    tab.click("Begin")
+    tab.click("Take")
+    tab.until("it records", lambda: "is being recorded" in tab.text("guide-words"), 30.0)
+
+    def held() -> bool:
+        tab.press("Hold to run")
+        try:
+            return tab.until("it moves", chain.moves, 5.0)
+        except AssertionError:
+            tab.let_go()
+            return False
+
+    tab.until("a run", held, 60.0)
+    tab.let_go()
+    tab.click("It succeeded")
+    tab.until(
+        "a data set", lambda: "/dataset: 1 episodes (1 success)" in tab.text("guide-words"), 60.0
+    )
+    assert (
+        tab.run("return document.querySelector('#steps [aria-current]').textContent") == "Data set"
+    )
 
 
 def test_the_drawing_is_turned_by_keys_and_by_dragging(chain: Chain, tab: Tab) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -40,6 +41,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 GARBAGE = 10_000
 STILL_MM = 2.0
 STOPS = 4
+END_S = 90.0
+"""An export of one short episode on a busy computer."""
 BRAKE_S = 0.5
 """A brake from the speed of these motions, on a busy computer."""
 
@@ -306,6 +309,7 @@ def test_a_viewer_looks_at_states_and_nothing_else(chain: Chain, site: Site) -> 
             {"do": "activate"},
             {"do": "stop"},
             {"do": "speed", "percent": 5},
+            {"do": "invite", "name": "eve", "role": "operator"},
         ):
             viewer.heard.clear()
             viewer.send(**request)
@@ -320,6 +324,62 @@ def test_a_viewer_looks_at_states_and_nothing_else(chain: Chain, site: Site) -> 
         socket.send(json.dumps({"do": "enter", "token": VIEWER}))
         with pytest.raises(ConnectionClosed):
             socket.recv(PATIENCE_S)
+
+
+def test_an_operator_invites_a_person_who_has_the_rights_that_were_given(
+    chain: Chain, site: Site
+) -> None:
+    with browsing(site) as browser:
+        browser.send(do="invite", name="carl", role="viewer")
+        token = browser.wait("invited")["token"]
+        browser.send(do="invite", name="carl", role="operator")
+        assert "carl already" in browser.wait("failed")["why"]
+        browser.wait("event", lambda event: "anna lets carl in, as viewer" in event["why"])
+        with browsing(site, token) as other:
+            assert other.answers("welcome")[0]["person"] == "carl"
+            until("both", lambda: len(browser.state["people"]) == 2)
+            assert [(one["name"], one["role"]) for one in browser.state["people"]] == [
+                ("anna", "operator"),
+                ("carl", "viewer"),
+            ]
+            other.send(do="stop")
+            assert "viewer" in other.wait("rejected")["why"]
+        until("carl left", lambda: len(browser.state["people"]) == 1)
+
+
+def test_the_banner_says_in_plain_words_what_the_arm_does(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        hold_until_it_moves(chain, browser)
+        until("who holds", lambda: "anna" in browser.state["banner"]["what"])
+        assert browser.state["people"][0]["holds"]
+        browser.let_go()
+        until("it stands", lambda: browser.state["banner"]["do"] == "Ready: hold to run.")
+
+
+def test_the_guide_records_a_take_and_makes_the_data_set(chain: Chain, site: Site) -> None:
+    def guide(browser: Browser, step: str) -> dict[str, Any]:
+        prompt = "HARD: go up" if chain.height_m() < 0.42 else chain.down
+        return browser.ask(do="guide", step=step, prompt=prompt, count=1)
+
+    def at(step: str) -> bool:
+        return browser.state["guide"]["step"] == step
+
+    with browsing(site) as browser:
+        assert guide(browser, "begin")["is"] == "done"
+        assert guide(browser, "take")["is"] == "done"
+        refused = browser.ask(do="record", on=False, verdict="", note="")
+        assert "episode of the guide" in refused["why"]
+        browser.hold_until("it moves", chain.moves, READY_PATIENCE_S)
+        browser.let_go()
+        until("to be judged", lambda: at("judge"))
+        assert guide(browser, "success")["is"] == "done"
+        until("the data set", lambda: at("done"), END_S)
+        text = browser.state["guide"]["text"]
+    found = re.match(r"(\S+/dataset): (\d+) episodes \((\d+) success\)", text)
+    assert found, text
+    assert found[2] == found[3]
+    info = json.loads((chain.profile_file.parent / found[1] / "meta/info.json").read_text())
+    assert info["total_episodes"] == int(found[2])
 
 
 def test_a_wrong_token_opens_nothing(chain: Chain, site: Site) -> None:

@@ -12,7 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from vla_zenoh_web import requests
-from vla_zenoh_web.access import People, Person, host_is_ours, origin_is_ours, read_people
+from vla_zenoh_web.access import (
+    MAX_PEOPLE,
+    People,
+    Person,
+    host_is_ours,
+    origin_is_ours,
+    read_people,
+)
 from vla_zenoh_web.hold import HOLD_S, Hold
 from vla_zenoh_web.requests import MAX_BYTES, AnyRequest, name_of, parse
 
@@ -44,6 +51,32 @@ def test_nobody_has_more_rights_than_the_certificate_of_the_server() -> None:
     found = People([ANNA, WALL], "viewer").find(ANNA.token)
     assert found is not None
     assert found.role == "viewer"
+
+
+def test_an_invited_person_is_found_and_has_no_more_rights_than_the_server() -> None:
+    people = People([ANNA])
+    assert people.invite("bob", "viewer", "bob's own token!").drives is False
+    assert people.find("bob's own token!") == Person("bob", "viewer", "bob's own token!")
+    bounded = People([ANNA], "viewer")
+    assert bounded.invite("eve", "operator", "eve's own token!").role == "viewer"
+
+
+@pytest.mark.parametrize(
+    ("name", "named"), [("anna", "anna already"), ("", "person"), ("a/b", "person")]
+)
+def test_a_name_that_is_taken_or_none_is_not_invited(name: str, named: str) -> None:
+    people = People([ANNA])
+    with pytest.raises(SecurityError, match=named):
+        people.invite(name, "viewer", "x" * 16)
+    assert people.find("x" * 16) is None
+
+
+def test_people_are_invited_up_to_a_number() -> None:
+    people = People([ANNA])
+    for number in range(MAX_PEOPLE - 1):
+        people.invite(f"guest-{number}", "viewer", f"token number {number:06d}")
+    with pytest.raises(SecurityError, match="people have a token"):
+        people.invite("one-more", "viewer", "x" * 16)
 
 
 def test_a_file_of_people_is_read(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from vla_zenoh.security.store import open_to_others
 PageRole = Literal["operator", "viewer"]
 MIN_TOKEN = 16
 """Characters: `openssl rand -hex 16` makes 32."""
+MAX_PEOPLE = 64
 
 
 class Person(NamedTuple):
@@ -44,10 +45,28 @@ class People:
     """
 
     def __init__(self, people: Iterable[Person], most: PageRole = "operator") -> None:
-        self._people = [
-            (_digest(one.token), one if most == "operator" else one._replace(role=most))
-            for one in people
-        ]
+        self._most: PageRole = most
+        self._people = [(_digest(one.token), self._bounded(one)) for one in people]
+
+    def _bounded(self, person: Person) -> Person:
+        return person if self._most == "operator" else person._replace(role=self._most)
+
+    def invite(self, name: str, role: PageRole, token: str) -> Person:
+        """One more person, for as long as this server runs.
+
+        Raises:
+            SecurityError: the name is none, or taken, or there are too many people.
+        """
+        try:
+            person = self._bounded(Person(key_chunk(name, "person"), role, token))
+        except ProfileError as error:
+            raise SecurityError(str(error)) from error
+        if any(known.name == name for _, known in self._people):
+            raise SecurityError(f"there is a {name} already: choose another name")
+        if len(self._people) >= MAX_PEOPLE:
+            raise SecurityError(f"{MAX_PEOPLE} people have a token: restart the server")
+        self._people.append((_digest(token), person))
+        return person
 
     def find(self, token: str) -> Person | None:
         """Whose token this is; takes the same time whatever is wrong with it."""

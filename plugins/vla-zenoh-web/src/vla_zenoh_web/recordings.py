@@ -35,8 +35,8 @@ class Recordings:
             return {"on": True, "text": f"FAILED: {recorder.recorded.failure}"}
         return {"on": True, "text": f"{path}, {time.monotonic() - began_s:.0f} s"}
 
-    def begin(self) -> str:
-        """Start one.
+    def begin(self, path: Path | None = None) -> str:
+        """Start one, into a new file of `RUNS` unless `path` says where.
 
         Raises:
             RecordingError: one runs already.
@@ -46,7 +46,7 @@ class Recordings:
         with self._lock, ExitStack() as stack:
             if self._running is not None:
                 raise RecordingError("a recording runs already")
-            path = self._folder / time.strftime("web-%Y%m%d-%H%M%S.mcap")
+            path = path or self._folder / time.strftime("web-%Y%m%d-%H%M%S.mcap")
             part = stack.enter_context(output_file(path))
             recorder = Recorder(self._profile, self._session, part).start()
             self._running = recorder, stack.pop_all(), path, time.monotonic()

@@ -114,6 +114,23 @@ class RecordRequest(SettingRequest):
     note: Text
 
 
+class GuideRequest(SettingRequest):
+    """A step of the guide; `prompt` and `count` are of ``begin``."""
+
+    step: Literal[
+        "begin", "scene", "take", "end", "again", "success", "failure", "void", "finish", "cancel"
+    ]
+    prompt: Text
+    count: Annotated[int, Meta(ge=1, le=1000)]
+
+
+class InviteRequest(PageRequest):
+    """Lets another person in, with a token of their own."""
+
+    name: Text
+    role: Literal["operator", "viewer"]
+
+
 class SaveRequest(SettingRequest):
     note: Text
 
@@ -138,11 +155,13 @@ Changes = (
     | DeactivateRequest
     | JogRequest
     | RecordRequest
+    | GuideRequest
     | SaveRequest
 )
 AnyRequest = (
     EnterRequest
     | StopRequest
+    | InviteRequest
     | Changes
     | HoldRequest
     | PrimitivePress

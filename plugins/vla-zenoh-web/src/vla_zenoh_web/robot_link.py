@@ -18,20 +18,30 @@ from vla_zenoh.client.client import Client, StopOutcome
 from vla_zenoh.client.primitives import ask
 from vla_zenoh.codec import records
 from vla_zenoh.codec.settings import decode_held
-from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
+from vla_zenoh.errors import (
+    CodecError,
+    RecordError,
+    RecordingError,
+    SessionError,
+    VlaZenohError,
+)
 from vla_zenoh.keys import ENDED, PRIMITIVES, ROLLING, last_chunk, worker_node
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, Event, NodeStatus, Task
+from vla_zenoh.types.records import LATENCY_STAGES
 from vla_zenoh_web import requests
+from vla_zenoh_web.episodes import Episodes
 from vla_zenoh_web.hand import HandWorker
 from vla_zenoh_web.hold import Hold
 from vla_zenoh_web.part_streams import PartStreams
+from vla_zenoh_web.plain_words import banner, holder_of
 from vla_zenoh_web.recordings import Recordings
 
 STAND_S, STAND_POLL_S = 3.0, 0.01
 WATCH_S = 0.05
 MAX_HOLDER = 48
+FORCE = "external_force_n"
 SPECS = 64
 
 
@@ -65,6 +75,7 @@ class RobotLink:
         self._hand = OperatorInput()
         self.hand = HandWorker(profile, self.client, self._read_hand)
         self.recordings = Recordings(profile, session)
+        self.episodes = Episodes(profile, self.client, self.recordings)
         self._watcher = threading.Thread(target=self._watch_hold, name="hold", daemon=True)
         self._watcher.start()
 
@@ -158,13 +169,16 @@ class RobotLink:
         state = "" if status is None else status.state
         if not alive and state not in ("", ENDED):
             state = "dead"
-        return {
+        found: dict[str, Any] = {
             "mode": mode_of(said),
             "state": state or "no command node",
             "silent_s": round(age_s, 2),
             "why": detail.get("why", ""),
             "at_rest": detail.get("at_rest"),
             "held_by": detail.get("held_by", ""),
+            "holder": holder_of(str(detail.get("held_by", ""))),
+            "force_n": _largest_force(detail),
+            "latency_ms": _latency(status) if alive else None,
             "limits": acting_limits(said),
             "done": detail.get("policy_done", False),
             "task": None if task is None else asdict(task),
@@ -178,6 +192,9 @@ class RobotLink:
                 if name.startswith(worker_node(""))
             ),
         }
+        found["banner"] = banner(found)._asdict()
+        found["guide"] = self.episodes.observe(by_hand=found["jog"])
+        return found
 
     # -- stopping -----------------------------------------------------------------------------
     def stop(self) -> dict[str, Any]:
@@ -232,6 +249,8 @@ class RobotLink:
                 return self.hand.give_back()
             case requests.SaveRequest():
                 return self.save(asked.note)
+            case requests.GuideRequest():
+                return self.episodes.do(asked)
             case requests.RecordRequest():
                 return self.record(asked.on, asked.verdict, asked.note)
 
@@ -358,6 +377,8 @@ class RobotLink:
 
     def record(self, on: bool, verdict: str, note: str) -> str:
         """Start a recording, or finish it with a person's verdict and note."""
+        if self.episodes.records:
+            raise RecordingError("an episode of the guide is being recorded: judge it there")
         if on:
             return self.recordings.begin()
         task = self.client.task
@@ -386,3 +407,15 @@ class RobotLink:
             subscriber.undeclare()
         for part in self._parts.values():
             part.close()
+
+
+def _largest_force(detail: Mapping[str, Any]) -> float | None:
+    """External force on the arm, of several the largest, in N; None: it is not measured."""
+    parts = detail.get("parts", {"": detail}).values()
+    return max((force for one in parts if (force := one.get(FORCE)) is not None), default=None)
+
+
+def _latency(status: NodeStatus | None) -> float | None:
+    """From an image to the first command of its chunk, median in ms."""
+    pair = None if status is None else status.latency_ms.get(LATENCY_STAGES[-1])
+    return None if pair is None else round(pair[0], 1)

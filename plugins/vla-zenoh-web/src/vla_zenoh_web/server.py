@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import secrets
 import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
@@ -26,6 +27,7 @@ from vla_zenoh_teleop.policy import OperatorInput
 
 from vla_zenoh.errors import CodecError, VlaZenohError
 from vla_zenoh.lab.rate_limit import RateLimit
+from vla_zenoh.types import Event
 from vla_zenoh_web import metrics, requests
 from vla_zenoh_web.access import People, Person, host_is_ours, origin_is_ours, with_headers
 from vla_zenoh_web.arm import surroundings
@@ -182,7 +184,7 @@ class PageServer:
                 self._news.append(news)
                 self._tell_all(news)
             if self._pages:
-                state = {**self._link.state(), "arms": self._link.arms(), "pages": len(self._pages)}
+                state = {**self._link.state(), "arms": self._link.arms(), "people": self._here()}
                 self._state = json.dumps(state)[1:]
                 if now_s - nodes_s > NODES_S:
                     nodes_s = now_s
@@ -191,6 +193,17 @@ class PageServer:
                 for page in self._pages.values():
                     page.changed.set()
             await asyncio.sleep(max(0.0, now_s + STATE_S - time.monotonic()))
+
+    def _here(self) -> list[dict[str, Any]]:
+        """Who has a page open, by name, and who of them holds the arm."""
+        found: dict[str, dict[str, Any]] = {}
+        for page in self._pages.values():
+            person = page.person
+            entry = {"name": person.name, "role": person.role, "pages": 0, "holds": False}
+            entry = found.setdefault(person.name, entry)
+            entry["pages"] += 1
+            entry["holds"] = entry["holds"] or self._link.holds(page.number)
+        return sorted(found.values(), key=lambda one: str(one["name"]))
 
     def _node_message(self) -> dict[str, Any]:
         return {"is": "nodes", **node_table(self._link.client), "counters": dict(self.counters)}
@@ -319,8 +332,23 @@ class PageServer:
                     page.tell({"is": "hold_ended", "press": request.press})
             case requests.ReleaseRequest():
                 link.release(page.number)
+            case requests.InviteRequest():
+                self._invite(page, request)
             case requests.SettingRequest():
                 self._change(page, name_of(request), lambda: link.set(request))
+
+    def _invite(self, page: Page, request: requests.InviteRequest) -> None:
+        """Tell this page alone the token of the new person, and every page the name."""
+        token = secrets.token_urlsafe(24)
+        try:
+            person = self._people.invite(request.name, request.role, token)
+        except VlaZenohError as error:
+            why = {"what": name_of(request), "press": 0, "why": str(error), "reasons": []}
+            page.tell({"is": "failed", **why})
+            return
+        page.tell({"is": "invited", **person._asdict()})
+        why = f"{page.person.name} lets {person.name} in, as {person.role}"
+        self._link.client.note("web", Event("info", "notice", "invited", why))
 
     def _press(self, page: Page, request: requests.PressRequest, call: Callable[[], Any]) -> None:
         """Begin a hold, and `call` with it."""

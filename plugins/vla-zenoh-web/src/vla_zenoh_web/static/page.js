@@ -1,7 +1,7 @@
 "use strict";
 // The page of one robot. Text of the robot only ever becomes textContent, never markup.
 
-const BEAT_MS = 100, SILENT_MS = 1000, POST_MS = 300, GIVE_UP_MS = 4000, PICTURE_HZ = 15, EVENTS = 200;
+const BEAT_MS = 100, SILENT_MS = 1000, POST_MS = 300, GIVE_UP_MS = 4000, ANSWER_MS = 8000, PICTURE_HZ = 15, EVENTS = 200;
 const $ = (id) => document.getElementById(id);
 const AXES = ["x", "y", "z", "rx", "ry", "rz"];
 const NONE = [0, 0, 0, 0, 0, 0];
@@ -52,12 +52,13 @@ const RECEIVE = {
   event: showEvent,
   welcome: enter,
   denied: (message) => askToken(message.why),
-  done: (message) => { if (message.what === "primitive") endHold(); answer(message.text || DONE[message.what] || "done", [], "good"); },
+  done: (message) => { if (message.what === "primitive") endHold(); answer(message.what === "guide" ? "" : message.text || DONE[message.what] || "done", [], "good"); },
   failed: (message) => { if (message.press) endHold(); answer(message.why, message.reasons, "bad"); },
   rejected: (message) => answer(`${message.what}: ${message.why}`, [], "bad"),
   hold_ended: (message) => { if (message.press === press) endHold(message.why || "the hold ended: press again"); },
   stopped: showStopped,
   recording: showRecording,
+  invited: showInvited,
 };
 function receive(message) { (RECEIVE[message.is] || (() => {}))(message); }
 
@@ -79,12 +80,13 @@ function enter(message) {
   welcome = message;
   document.title = `${message.robot} - vla-zenoh`;
   $("robot").textContent = message.robot;
-  $("who").textContent = `${message.person}, ${message.drives ? "operator" : "viewer"}`;
+  $("who").replaceChildren(message.person, el("span", message.drives ? ", operator" : ", viewer", { className: "role" }));
   for (const node of document.querySelectorAll(".drives")) node.disabled = !message.drives;
   for (const node of document.querySelectorAll(".operator")) node.hidden = !message.drives;
   $("stop").disabled = !message.drives;
   $("look").hidden = !message.drives;
   if (!message.drives) $("hold-help").textContent = "A viewer may look. Stop at the robot, or ask an operator.";
+  $("reset").hidden = true;
   warn(message.insecure ? "Insecure profile: anyone on the network can command this robot." : "");
   $("arm-words").textContent = message.no_arm;
   $("keep-out-legend").hidden = Object.values(message.surroundings).every((part) => !Object.keys(part.keep_out).length);
@@ -112,8 +114,10 @@ function showLink() {
   const late = !silent && state.silent_s > 2;
   setText($("link"), silent ? "NOT CONNECTED" : late ? "robot silent" : "connected");
   $("link").className = `badge ${silent || late ? "bad" : "good"}`;
-  if (silent) setText($("stop-words"), "Not connected: this page stops nothing. Use the robot's own emergency stop.");
-  else if ($("stop-words").textContent.startsWith("Not connected")) setText($("stop-words"), "");
+  if (silent) {
+    setText($("stop-words"), "Not connected: this page stops nothing. Use the robot's own emergency stop.");
+    showBanner({ level: "bad", what: "This page has no connection to the robot.", do: "It connects again by itself. A hold has ended." });
+  } else if ($("stop-words").textContent.startsWith("Not connected")) setText($("stop-words"), "");
 }
 setInterval(showLink, 250);
 
@@ -122,7 +126,11 @@ const GOOD = ["active", "inferring", "running", "routing", "ok"], BAD = ["stoppe
 const level = (word) => (GOOD.includes(word) ? "good" : BAD.includes(word) ? "bad" : "warn");
 const MODES = { sim: "SIM", dry_run: "DRY RUN", live: "LIVE", unknown: "MODE UNKNOWN" };
 
-const holder = (name) => name.replace(/^web-(.+)-[^-]+$/, "$1, on the page"); // of a deadman's token
+function showBanner(banner) {
+  $("banner").className = banner.level;
+  setText($("what"), banner.what);
+  setText($("do"), banner.do);
+}
 function showState(message) {
   state = message;
   tick = message.tick;
@@ -130,6 +138,10 @@ function showState(message) {
   $("mode").className = `badge ${message.mode === "live" ? "bad" : "quiet"}`;
   setText($("state"), message.state);
   $("state").className = `badge ${level(message.state)}`;
+  const guided = message.guide.step !== "done" && message.state === "inactive" && message.guide.text;
+  const next = message.you_hold && message.state === "active" ? "Let go to brake." : guided || message.banner.do;
+  showBanner({ ...message.banner, do: next });
+  $("reset").hidden = !welcome.drives || !["stopped", "fault"].includes(message.state);
   const task = message.task;
   if (task) {
     if (!promptTyped) setUnlessFocused("prompt", task.prompt);
@@ -140,13 +152,14 @@ function showState(message) {
   const arms = Object.entries(message.arms || {}), fastest = Math.max(0, ...arms.map(([, arm]) => arm.speed_m_s || 0));
   facts([
     ["why", message.why.replace(/'web-(.+?)-[0-9a-f]+'/, "$1")],
-    ["held by", message.you_hold ? "you" : message.held_by ? holder(message.held_by) : task && task.active ? "nobody: it runs without a hold" : "nobody"],
+    ["held by", message.you_hold ? "you" : message.holder ? message.holder : task && task.active ? "nobody: it runs without a hold" : "nobody"],
     ["arm", `${message.at_rest === null ? "unknown" : message.at_rest ? "stands" : "moves"}, ${(fastest * 100).toFixed(1)} cm/s`],
     ...arms.map(([name, arm]) => [`gripper ${name}`.trim(), arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}${arm.holds ? `, counted as a box of ${arm.holds} m` : ""}`]),
     ["limits", message.limits.join("; ")],
-    ["pages", String(message.pages)],
   ]);
-  $("activate").classList.toggle("next", !(task && task.active));
+  showPeople(message.people);
+  showGuide(message.guide, message.mode);
+  keepTrend(message, fastest);
   $("take").setAttribute("aria-pressed", String(message.jog === true));
   setText($("take"), message.jog ? "Hand back" : "Take the arm");
   for (const button of $("pad").children) button.disabled = !message.jog;
@@ -158,6 +171,35 @@ function showState(message) {
   if (stopping && message.state === "stopped") setText($("stop-words"), `${welcome.robot}: stopped, coming to rest`);
   else if (message.state === "stopped" && !$("stop-words").textContent) setText($("stop-words"), `${welcome.robot} is stopped: ${message.why}`);
 }
+
+function showPeople(people) {
+  const lines = people.map((one) => `${one.name}, ${one.role}${one.pages > 1 ? `, ${one.pages} pages` : ""}${one.holds ? ": holds the arm" : ""}`);
+  if ([...$("here").children].map((line) => line.textContent).join("\n") !== lines.join("\n"))
+    $("here").replaceChildren(...lines.map((line) => el("li", line)));
+}
+$("invite").addEventListener("submit", (event) => {
+  event.preventDefault();
+  send({ do: "invite", name: $("invite-name").value.trim(), role: $("invite-role").value });
+});
+function showInvited(message) {
+  const link = `${location.origin}/#${message.token}`;
+  $("invite-name").value = "";
+  $("invited-link").hidden = false;
+  $("invited-link").value = link;
+  $("invited-link").select();
+  setText($("invited-words"), `The link below is ${message.name}'s alone, until this server ends.`);
+  if (navigator.clipboard) navigator.clipboard.writeText(link).then(() => setText($("invited-words"), `${$("invited-words").textContent} It is copied.`), () => {});
+}
+$("leave").addEventListener("click", () => {
+  endHold();
+  for (const socket of [control, pictures]) if (socket) { socket.onclose = null; socket.close(); }
+  control = pictures = null;
+  token = "";
+  for (const node of document.querySelectorAll(".drives")) node.disabled = true;
+  welcome = { drives: false };
+  setText($("who"), "");
+  askToken("");
+});
 
 function setUnlessFocused(id, value) { if (document.activeElement !== $(id) && $(id).value !== value) $(id).value = value; }
 
@@ -176,10 +218,13 @@ function facts(pairs) {
   shown.forEach(([name, text], at) => { setText(list.children[2 * at], name); setText(list.children[2 * at + 1], text); });
 }
 
-function answer(text, reasons, how) {
+let answerTimer = 0;
+function answer(text, reasons, how) { // what went well makes room again
+  clearTimeout(answerTimer);
+  if (how === "good") answerTimer = setTimeout(answer, ANSWER_MS, "", [], "");
   const list = el("ul", null, {}, ...reasons.map((reason) => el("li", reason)));
   $("answer").className = how;
-  $("answer").replaceChildren(el("span", text), ...(reasons.length ? [list] : []));
+  $("answer").replaceChildren(...(text ? [el("span", text)] : []), ...(reasons.length ? [list] : []));
 }
 
 // -- requests -----------------------------------------------------------------------------
@@ -194,10 +239,27 @@ for (const name of ["activate", "deactivate", "reset"])
   $(name).addEventListener("click", () => { answer(`${name}...`, [], "quiet"); send({ do: name }); });
 
 // -- stop ---------------------------------------------------------------------------------
+let sound = null;
+function buzz(pattern_ms, hz) { // felt on a phone, heard where nothing can be felt; [on, off, on, ...]
+  if (navigator.vibrate) navigator.vibrate(pattern_ms);
+  sound = sound || new AudioContext();
+  sound.resume();
+  let at = sound.currentTime;
+  pattern_ms.forEach((ms, number) => {
+    if (number % 2 === 0) {
+      const tone = new OscillatorNode(sound, { frequency: hz }), quiet = new GainNode(sound, { gain: 0.15 });
+      tone.connect(quiet).connect(sound.destination);
+      tone.start(at);
+      tone.stop(at + ms / 1000);
+    }
+    at += ms / 1000;
+  });
+}
 function stop() {
   if (!welcome.drives) return;
   endHold();
   const began = (stopping = performance.now());
+  buzz([150], 330);
   setText($("stop-words"), `stopping ${welcome.robot}...`);
   const sent = send({ do: "stop" });
   clearTimeout(stopTimer);
@@ -213,11 +275,13 @@ function post(began) {
 }
 function unconfirmed() {
   stopping = 0;
+  buzz([400, 100, 400], 220);
   setText($("stop-words"), `NOT CONFIRMED: no answer of robot ${welcome.robot}. The stop may still have arrived. USE THE ROBOT'S OWN EMERGENCY STOP`);
 }
 function showStopped(report) {
   const mine = stopping ? performance.now() - stopping : 0;
   stopping = 0;
+  buzz(report.outcome === "confirmed" ? [70, 60, 70] : [400, 100, 400], report.outcome === "confirmed" ? 660 : 220);
   if (report.outcome !== "confirmed") { setText($("stop-words"), report.message); return; }
   const stood = `stood at ${clock(report.at_ms)}, ${seconds(mine ? mine / 1000 : report.stands_s)} after the ${mine ? "touch" : `stop by ${report.by}`}`;
   setText($("stop-words"), `${report.message}; ${stood}. Reset clears it.`);
@@ -305,6 +369,36 @@ function showRecording(message) {
   setText($("recording"), message.text);
 }
 
+// -- the guide ----------------------------------------------------------------------------
+const GUIDE = { // step -> its buttons: words, request, looks
+  scene: [["Take", "take", "main"], ["Put the simulated scene back", "scene"], ["Finish now", "finish"], ["Cancel", "cancel"]],
+  take: [["End the take", "end", "main"], ["Cancel", "cancel"]],
+  judge: [["It succeeded", "success", "main"], ["It failed", "failure"], ["Does not count", "void"], ["Go on with this take", "again"], ["Cancel", "cancel"]],
+};
+let guideStep = "";
+function guide(step) { send({ do: "guide", step, prompt: $("guide-prompt").value, count: Number($("guide-count").value) || 10 }); }
+$("guide-form").addEventListener("submit", (event) => { event.preventDefault(); guide("begin"); });
+function showGuide(now, mode) {
+  const free = now.step === "idle" || now.step === "done";
+  setText($("guide-words"), now.text);
+  $("guide-form").hidden = !free;
+  $("guide-bar").hidden = free;
+  Object.assign($("guide-bar"), { max: Math.max(1, now.wanted), value: now.kept });
+  if (guideStep === now.step) return;
+  const began = guideStep !== "";
+  guideStep = now.step;
+  for (const item of $("steps").children) {
+    if (item.dataset.step === (now.step === "done" ? "export" : now.step)) item.setAttribute("aria-current", "step");
+    else item.removeAttribute("aria-current");
+  }
+  $("guide-buttons").replaceChildren(...(GUIDE[now.step] || []).filter(([, step]) => step !== "scene" || mode === "sim").map(([words, step, looks]) => {
+    const button = el("button", words, { type: "button", className: looks || "small" });
+    button.addEventListener("click", () => guide(step));
+    return button;
+  }));
+  if (began && !$("guide").hidden && !free) $("guide").scrollIntoView({ block: "nearest" });
+}
+
 $("save").addEventListener("click", () => send({ do: "save", note: $("note").value }));
 
 // -- pictures -----------------------------------------------------------------------------
@@ -358,12 +452,21 @@ document.addEventListener("visibilitychange", look);
 function picture(name) {
   if (shown.has(name)) return shown.get(name);
   const canvas = el("canvas", null, { width: 640, height: 480 }), caption = el("figcaption", title(name));
-  canvas.setAttribute("role", "img");
-  canvas.setAttribute("aria-label", `picture of ${title(name)}`);
-  const figure = el("figure", null, {}, canvas, caption);
+  const touch = el("button", null, { type: "button", className: "picture" }, canvas);
+  touch.setAttribute("aria-label", `picture of ${title(name)}, large`);
+  touch.setAttribute("aria-pressed", "false");
+  const figure = el("figure", null, {}, touch, caption);
+  touch.addEventListener("click", () => enlarge(figure));
   $("pictures").append(figure);
   shown.set(name, { figure, canvas, caption, frames: 0, sinceMs: performance.now(), latency: [] });
   return shown.get(name);
+}
+function enlarge(figure) { // over the page, but for the dock with STOP; another touch puts it back
+  for (const other of document.querySelectorAll("#pictures figure")) {
+    const large = other === figure && !other.classList.contains("large");
+    other.classList.toggle("large", large);
+    other.firstChild.setAttribute("aria-pressed", String(large));
+  }
 }
 function draw(head, image) {
   if (!chosen.has(head.name)) return;
@@ -528,7 +631,59 @@ function showEvent(event) {
   while ($("events").children.length > EVENTS) $("events").lastChild.remove();
 }
 
+// -- the last minute ----------------------------------------------------------------------
+const MINUTE_MS = 60000, TREND_MS = 200;
+const TRENDS = [ // name, unit, least top of the axis, colour
+  ["speed", "cm/s", 10, "command"], ["latency", "ms", 50, "chunk"], ["force", "N", 10, "keep-out"], ["limits", "", 1, "warn"],
+];
+const past = [];
+const trendViews = TRENDS.map(([name]) => {
+  const canvas = el("canvas"), caption = el("figcaption", name);
+  canvas.setAttribute("role", "img");
+  $("lines").append(el("figure", null, {}, canvas, caption));
+  return { canvas, caption };
+});
+function keepTrend(message, fastest) {
+  const now = performance.now();
+  if (past.length && now - past[past.length - 1].at < TREND_MS / 2) return;
+  const speed = Object.values(message.arms || {}).some((arm) => arm.speed_m_s !== undefined) ? fastest * 100 : null;
+  const names = message.limits.map((limit) => limit.split(":")[0].replaceAll("_", " "));
+  past.push({ at: now, speed, latency: message.latency_ms, force: message.force_n, limits: names.length, names });
+  while (past[0].at < now - MINUTE_MS) past.shift();
+}
+function drawTrends() {
+  if (document.hidden || !past.length) return;
+  const style = getComputedStyle(document.documentElement), scale = window.devicePixelRatio || 1, now = performance.now();
+  TRENDS.forEach(([name, unit, least, ink], row) => {
+    const { canvas, caption } = trendViews[row];
+    const width = Math.round(canvas.clientWidth * scale), height = Math.round(canvas.clientHeight * scale);
+    if (!width) return;
+    if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+    const known = past.filter((each) => each[name] !== null), last = past[past.length - 1];
+    const most = Math.max(0, ...known.map((each) => each[name])), top = 1.1 * Math.max(least, most);
+    const pen = canvas.getContext("2d");
+    pen.clearRect(0, 0, width, height);
+    Object.assign(pen, { strokeStyle: style.getPropertyValue(`--${ink}`), lineWidth: 2 * scale, lineJoin: "round" });
+    pen.beginPath();
+    let joined = false;
+    for (const each of past) {
+      const x = width * (1 - (now - each.at) / MINUTE_MS), y = height - scale - ((height - 2 * scale) * each[name]) / top;
+      if (each[name] === null) joined = false;
+      else { joined ? pen.lineTo(x, y) : pen.moveTo(x, y); joined = true; }
+    }
+    pen.stroke();
+    const figure = (value) => (value === null ? "not measured" : `${value.toFixed(name === "latency" ? 0 : 1)} ${unit}`);
+    const words = name === "limits"
+      ? `limits: ${last.names.join(", ") || "none acts"}; in this minute: ${[...new Set(past.flatMap((each) => each.names))].join(", ") || "none"}`
+      : `${name} ${figure(last[name])}; at most ${figure(known.length ? most : null)}`;
+    setText(caption, words);
+    canvas.setAttribute("aria-label", `${words}, in the last minute`);
+  });
+}
+setInterval(drawTrends, TREND_MS);
+
 // -- begin --------------------------------------------------------------------------------
+new ResizeObserver(() => document.documentElement.style.setProperty("--dock", `${$("dock").offsetHeight}px`)).observe($("dock"));
 const given = decodeURIComponent(location.hash.slice(1)) || sessionStorage.getItem("token") || "";
 if (location.hash) history.replaceState(null, "", location.pathname); // the token stays out of the history
 if (given) useToken(given);
