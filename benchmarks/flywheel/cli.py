@@ -48,6 +48,7 @@ REQUIREMENTS = (
 PACKAGES = (".", *(f"plugins/vla-zenoh-{name}" for name in ("policy-servers", "benchmarks")))
 PYTHON = "3.12"
 CAMERA, SIZE = "front", 96
+EXPERT = "metaworld_expert"
 FIRST_UNSEEN, FIRST_CORRECTED = 1000, 2000
 """Demonstrations have the seeds from 0 on."""
 BATCH = 10
@@ -57,7 +58,7 @@ CHUNK, REPLAN = 80, 20
 time."""
 DELAYS_MS = (0, 100, 200, 400)
 ACT, LAST = "act", "checkpoints/last/pretrained_model"
-CORRECTED_DATA = "corrected-dataset"
+CORRECTED, LONGER, CORRECTED_DATA = "corrected-act", "longer-act", "corrected-dataset"
 CELL = ("success", "steps", "end", "taken_over_at")
 WAYS = {
     "stand": ("--mode", "live"),
@@ -117,7 +118,7 @@ class Flywheel:
 
     # -- steps ------------------------------------------------------------------------------------
     def record(self) -> dict[str, Any]:
-        words = self._bench("metaworld_expert", 0, self.demonstrations, "demonstrations")
+        words = self._bench(EXPERT, 0, self.demonstrations, "demonstrations")
         return self._run_bench([*words, "--record", CAMERA], "demonstrations")
 
     def export(self) -> dict[str, Any]:
@@ -129,7 +130,10 @@ class Flywheel:
         """A data set of all demonstrations, and of `more` recordings."""
         words = ["dataset", "export", str(self.folder / "demonstrations" / "recordings")]
         words += [*map(str, more), "-o", str(dataset), "--camera", CAMERA, "--label", "success"]
-        words += ["--state", "position+gripper_open", "--no-rotation", "--force"]
+        # What the policy did before the expert took over is no example (HG-DAgger: Kelly et al.,
+        # ICRA 2019).
+        words += ["--worker", EXPERT, "--state", "position+gripper_open", "--no-rotation"]
+        words += ["--force"]
         command = self._vla_zenoh(words)
         info = json.loads((dataset / "meta" / "info.json").read_text("utf-8"))
         counts = {"episodes": info["total_episodes"], "frames": info["total_frames"]}
@@ -171,7 +175,7 @@ class Flywheel:
 
     def takeover(self) -> dict[str, Any]:
         """The expert corrects the policy on seeds that neither training nor evaluation has."""
-        more = ("--takeover", "metaworld_expert", "--record", CAMERA)
+        more = ("--takeover", EXPERT, "--record", CAMERA)
         return self._policy("takeover", FIRST_CORRECTED, self.corrections, ACT, more)
 
     def corrected_dataset(self) -> dict[str, Any]:
@@ -179,9 +183,13 @@ class Flywheel:
         taken = [
             self.folder / "takeover" / "recordings" / f"lerobot.{self.task}.{each['seed']}.mcap"
             for each in self.rows["takeover"]["all"]
-            if each["taken_over_at"] is not None
+            if "taken_over_at" in each
         ]
         return self._export(self.folder / CORRECTED_DATA, taken)
+
+    def cells(self, ours: str, theirs: str) -> dict[str, Any]:
+        """Both evaluations of one policy, seed by seed."""
+        return compare_cells(self.rows[ours]["all"], self.rows[theirs]["all"])
 
     def compare(self, before: str, after: str) -> dict[str, Any]:
         """Both on the same seeds."""
@@ -200,13 +208,13 @@ class Flywheel:
         return self._run_bench([*words, "--set", f"action={told}"], name)
 
     def expert(self) -> dict[str, Any]:
-        words = self._bench("metaworld_expert", FIRST_UNSEEN, self.episodes, "expert")
+        words = self._bench(EXPERT, FIRST_UNSEEN, self.episodes, "expert")
         return self._run_bench(words, "expert")
 
-    def theirs(self) -> dict[str, Any]:
+    def theirs(self, name: str, checkpoint: str) -> dict[str, Any]:
         """``lerobot-eval`` on the same seeds, `BATCH` at a time."""
-        out, command, cells = self.folder / "lerobot-eval", "", list[dict[str, Any]]()
-        policy = self.folder / ACT / LAST
+        out, command, cells = self.folder / name, "", list[dict[str, Any]]()
+        policy = self.folder / checkpoint / LAST
         for first in range(FIRST_UNSEEN, FIRST_UNSEEN + self.episodes, BATCH):
             count = min(BATCH, FIRST_UNSEEN + self.episodes - first)
             folder = out / str(first)
@@ -345,7 +353,7 @@ def flywheel(
     ] = 50,
     more_steps: Annotated[
         int, typer.Option(help="Of the training after the expert's corrections.")
-    ] = 2000,
+    ] = 3000,
     python: Annotated[
         Path | None,
         typer.Option(help="Interpreter of a prepared environment; default: one is made."),
@@ -368,31 +376,29 @@ def flywheel(
         "dataset": wheel.export,
         "training": wheel.training,
         "native": lambda: wheel.policy("native"),
-        "lerobot-eval": wheel.theirs,
-        "cells": lambda: compare_cells(
-            wheel.rows["native"]["all"], wheel.rows["lerobot-eval"]["all"]
-        ),
+        "lerobot-eval": lambda: wheel.theirs("lerobot-eval", ACT),
+        "cells": lambda: wheel.cells("native", "lerobot-eval"),
         "expert": wheel.expert,
         "zero": lambda: wheel.constant("zero", (0, 0, 0, 0)),
         "mean": lambda: wheel.constant("mean", mean_action(wheel.dataset)),
+        "takeover": wheel.takeover,
+        "corrected-dataset": wheel.corrected_dataset,
+        "corrected-training": lambda: wheel.train_on(CORRECTED, wheel.folder / CORRECTED_DATA),
+        "longer-training": lambda: wheel.train_on(LONGER, wheel.dataset),
+        "corrected": lambda: wheel.policy("corrected", checkpoint=CORRECTED),
+        "longer": lambda: wheel.policy("longer", checkpoint=LONGER),
+        "native-to-corrected": lambda: wheel.compare("native", "corrected"),
+        "longer-to-corrected": lambda: wheel.compare("longer", "corrected"),
+        "corrected-lerobot-eval": lambda: wheel.theirs("corrected-lerobot-eval", CORRECTED),
+        "corrected-cells": lambda: wheel.cells("corrected", "corrected-lerobot-eval"),
     }
     for delay_ms in waits:
         for way, words in WAYS.items():
             name = f"{way}-{delay_ms}ms"
             more = (*words, "--delay", str(delay_ms), "--set", f"horizon={CHUNK}")
-            plan[name] = lambda name=name, more=more: wheel.policy(name, *more)
-    plan |= {
-        "takeover": wheel.takeover,
-        "corrected-dataset": wheel.corrected_dataset,
-        "corrected-training": lambda: wheel.train_on(
-            "corrected-act", wheel.folder / CORRECTED_DATA
-        ),
-        "longer-training": lambda: wheel.train_on("longer-act", wheel.dataset),
-        "corrected": lambda: wheel.policy("corrected", checkpoint="corrected-act"),
-        "longer": lambda: wheel.policy("longer", checkpoint="longer-act"),
-        "native-to-corrected": lambda: wheel.compare("native", "corrected"),
-        "longer-to-corrected": lambda: wheel.compare("longer", "corrected"),
-    }
+            plan[name] = lambda name=name, more=more: wheel.policy(
+                name, *more, checkpoint=CORRECTED
+            )
     if until and until not in plan:
         raise typer.BadParameter(f"--until: the steps are {', '.join(plan)}")
     for name, do in plan.items():

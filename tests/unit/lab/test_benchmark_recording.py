@@ -119,6 +119,15 @@ def test_a_hand_that_never_turns_is_exported_without_rotations(tmp_path: Path) -
     assert options["rotation"] == "none"
 
 
+def test_policies_that_plan_another_number_of_steps_make_one_data_set(tmp_path: Path) -> None:
+    runs = [recorded(tmp_path / name, steps=count) for name, count in (("a", 1), ("b", 3))]
+    folder = tmp_path / "data"
+    export(folder, [the_episode(path) for _, path in runs], [CAMERA], ["position"])
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    assert info["total_episodes"] == 2
+    assert info["total_frames"] == sum(outcome.steps for outcome, _ in runs)
+
+
 def test_a_number_that_never_changed_has_a_std_to_scale_with(tmp_path: Path) -> None:
     _, path = recorded(tmp_path / "runs")
     folder = tmp_path / "data"

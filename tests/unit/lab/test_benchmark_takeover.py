@@ -39,7 +39,7 @@ class Wrong(Reacher):
 
 
 def corrected(
-    folder: Path, model: Reacher, disagreement: float = 0.7
+    folder: Path, model: Reacher, disagreement: float = 0.7, worker: str | None = None
 ) -> tuple[EpisodeOutcome, RecordedEpisode]:
     """An episode with a teacher that reaches the mark, and its recording."""
     benchmark, wanted = own_benchmark(), request("far")
@@ -51,7 +51,7 @@ def corrected(
     takeover = Takeover(teacher, disagreement)
     outcome = run_episode(benchmark, wanted, model, EpisodeConditions(), recorder, takeover)
     recorder.finish(success=outcome.success, steps=outcome.steps)
-    (episode,) = episodes_of(load_run(path))
+    (episode,) = episodes_of(load_run(path), worker)
     return outcome, episode
 
 
@@ -73,6 +73,14 @@ def test_every_frame_has_the_step_that_was_carried_out_whoever_led(tmp_path: Pat
     outcome, episode = corrected(tmp_path, Wrong(np.pi))
     recorded = np.array([frame.action for frame in episode.frames])
     np.testing.assert_allclose(recorded, np.array(outcome.actions), atol=1e-7)
+
+
+def test_what_the_teacher_led_alone_is_an_episode_of_its_own(tmp_path: Path) -> None:
+    outcome, episode = corrected(tmp_path, Wrong(np.pi), worker=TEACHER)
+    assert outcome.taken_over_at is not None
+    assert succeeded(episode)
+    own = np.array(outcome.actions[outcome.taken_over_at :], np.float32)
+    np.testing.assert_array_equal([frame.action for frame in episode.frames], own)
 
 
 @pytest.mark.parametrize("model", [Wrong(0.0), Wrong(np.pi / 8)])

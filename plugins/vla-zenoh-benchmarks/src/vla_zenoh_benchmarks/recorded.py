@@ -71,7 +71,7 @@ class EpisodeRecorder:
         self.cameras: Sequence[str] = tuple(cameras)
         self._path, self._part = path, path.with_suffix(".part")
         self._part.unlink(missing_ok=True)
-        self._keys, self._model, self._worker = profile.keys, worker, worker
+        self._keys, self._worker = profile.keys, worker
         self._action, self._gripper = action, profile.robot.gripper
         self._width_m = self._gripper.max_width_m
         self._spec_hash = spec.hash
@@ -156,7 +156,7 @@ class EpisodeRecorder:
         done = Task(1, False, self._task.prompt, self._worker, self._task.rate_hz)
         self._put(self._keys.task, done, at_ns, COMMAND, 2)
         verdict = "success" if success else "failure"
-        self._out.finish({FACT: {"worker": self._model, "verdict": verdict}})
+        self._out.finish({FACT: {"worker": self._worker, "verdict": verdict}})
         self._part.rename(self._path)
 
     def abandon(self) -> None:

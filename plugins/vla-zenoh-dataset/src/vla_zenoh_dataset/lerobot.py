@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.lab.video import CODEC, PIXEL_FORMAT
+from vla_zenoh.policy import ActionSpec
 from vla_zenoh_dataset.episodes import RecordedEpisode, fps_of
 from vla_zenoh_dataset.features import (
     ACTION,
@@ -97,7 +98,7 @@ def export(
     """
     if not episodes:
         raise RecordingError("the recordings hold no episode: no chunk was executed in them")
-    if any(episode.spec.action != episodes[0].spec.action for episode in episodes):
+    if any(_step(episode) != _step(episodes[0]) for episode in episodes):
         whose = ", ".join(sorted({episode.worker for episode in episodes}))
         raise RecordingError(
             f"the actions of the workers {whose} do not mean the same; choose one with --worker"
@@ -108,6 +109,12 @@ def export(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RecordingError(f"{folder} is there already; give --output a new folder")
     return _Dataset(folder, episodes, cameras, parts, depth, rotation=rotation).write(progress)
+
+
+def _step(episode: RecordedEpisode) -> dict[str, ActionSpec]:
+    """What a step of an episode means; a policy may plan more of them at once than another."""
+    spec = episode.spec
+    return {part: spec.action.of(part).model_copy(update={"horizon": 1}) for part in spec.parts}
 
 
 class _Dataset:
