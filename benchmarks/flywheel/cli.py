@@ -111,7 +111,7 @@ class Flywheel:
             found = {"step": name, **do(), "seconds": round(time.monotonic() - began_s, 1)}
             file.parent.mkdir(parents=True, exist_ok=True)
             part = file.with_suffix(".part")
-            part.write_text(json.dumps(found, indent=2) + "\n", "utf-8")
+            part.write_text(self._anywhere(json.dumps(found, indent=2)) + "\n", "utf-8")
             part.replace(file)
         self.rows[name] = json.loads(file.read_text("utf-8"))
         return self.rows[name]
@@ -198,8 +198,8 @@ class Flywheel:
             [sys.executable, "-m", "vla_zenoh", *words], capture_output=True, text=True, check=False
         )
         if told.returncode not in (0, B_IS_WORSE):
-            raise NodeError(f"{self._shown(words)}: {told.stderr.strip()}")
-        return {"command": self._shown(["vla-zenoh", *words]), **json.loads(told.stdout)}
+            raise NodeError(f"{_shown(words)}: {told.stderr.strip()}")
+        return {"command": _shown(["vla-zenoh", *words]), **json.loads(told.stdout)}
 
     def constant(self, name: str, action: Sequence[float]) -> dict[str, Any]:
         model = str(Path(__file__).with_name("constant.py"))
@@ -229,7 +229,7 @@ class Flywheel:
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir(parents=True)
                 self._lerobot("lerobot-eval", words)
-            command = command or self._shown(["lerobot-eval", *words])
+            command = command or _shown(["lerobot-eval", *words])
             cells += _cells(folder)
         return {"command": command, "all": cells, "successes": sum(c["success"] for c in cells)}
 
@@ -259,17 +259,17 @@ class Flywheel:
 
     def _vla_zenoh(self, words: Sequence[str]) -> str:
         _call([sys.executable, "-m", "vla_zenoh", *words], {})
-        return self._shown(["vla-zenoh", *words])
+        return _shown(["vla-zenoh", *words])
 
     def _lerobot(self, program: str, words: Sequence[str], log: Path | None = None) -> str:
         offline = {"HF_HUB_OFFLINE": "1", "MUJOCO_GL": "egl", "PYTHONPATH": str(ROOT)}
         _call([str(self.python.with_name(program)), *words], offline, log)
-        return self._shown([program, *words])
+        return _shown([program, *words])
 
-    def _shown(self, words: Sequence[str]) -> str:
-        """A command with the names of this computer's folders left out."""
-        told = _shown(words).replace(str(self.python), "PYTHON").replace(str(self.folder), "OUTPUT")
-        return told.replace(f"{ROOT}/", "")
+    def _anywhere(self, text: str) -> str:
+        """A text without this computer's folders."""
+        text = text.replace(str(self.python), "PYTHON").replace(str(self.folder), "OUTPUT")
+        return text.replace(f"{ROOT}/", "")
 
 
 def _cells(folder: Path) -> list[dict[str, Any]]:

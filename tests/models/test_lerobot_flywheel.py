@@ -1,7 +1,8 @@
 """`make flywheel` in small: Meta-World's expert, data set, LeRobot's trainer, and both evaluations.
 
-20 steps teach a network nothing. What is shown: every step runs, and what LeRobot's own
-`lerobot-eval` does with the policy on a seed is what `bench sim` does with it as a worker.
+20 steps teach a network nothing. What is shown: every step runs, what LeRobot's own `lerobot-eval`
+does with the policy on a seed is what `bench sim` does with it as a worker, and corrections are
+trained on.
 """
 
 from __future__ import annotations
@@ -31,10 +32,11 @@ SMALL = (
 
 def run(folder: Path) -> None:
     words = ["--demonstrations", str(EPISODES), "--steps", "20", "--episodes", str(EPISODES)]
+    words += ["--corrections", "1", "--more-steps", "2"]
     words += [word for each in SMALL for word in ("--train", each)]
     command = [sys.executable, "-m", "benchmarks", "flywheel", "-o", str(folder), "--delays", ""]
     done = subprocess.run(
-        [*command, *words, "--until", "cells"],
+        [*command, *words, "--until", "native-to-corrected"],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -68,6 +70,20 @@ def test_the_expert_demonstrates_and_the_data_set_has_the_statistics_of_its_reco
 def test_both_evaluations_end_every_episode_in_the_same_state_bit_by_bit(folder: Path) -> None:
     cells = row(folder, "cells")
     assert (cells["of"], cells["same"], cells["same_end"]) == (EPISODES,) * 3
+
+
+def test_the_expert_takes_over_and_what_it_led_is_trained_on(folder: Path) -> None:
+    (watched,) = row(folder, "takeover")["all"]
+    assert watched["success"]
+    led = watched["steps"] - watched["taken_over_at"]
+    written, corrected = row(folder, "dataset"), row(folder, "corrected-dataset")
+    assert led > 0
+    assert corrected["led_by_the_expert"] == led
+    assert corrected["episodes"] == EPISODES + 1
+    assert corrected["frames"] == written["frames"] + led
+    for step in ("corrected-training", "longer-training"):
+        assert row(folder, step)["steps"] == 2
+    assert row(folder, "native-to-corrected")["pairs"] == EPISODES
 
 
 def test_a_second_run_does_nothing_again(folder: Path) -> None:
