@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from vla_zenoh_benchmarks.process import BenchmarkLost, replay_episode, run_epis
 from vla_zenoh_benchmarks.result import summary, write_page
 from vla_zenoh_benchmarks.run import run_at_places
 
-from vla_zenoh.errors import NodeError, OutputError, SpecError, WorkerError
+from vla_zenoh.errors import NodeError, OutputError, RecordError, SpecError, WorkerError
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.loader import find_model
 
@@ -230,6 +230,23 @@ def test_two_results_are_compared_episode_by_episode() -> None:
     a, b = (read_run(json.dumps(each).encode(), "") for each in (native, live))
     found = compare(a, b, ("mode", "delay_ms"))
     assert (found.counts.both, found.counts.second, found.counts.difference) == (2, 2, -0.5)
+
+
+@pytest.mark.parametrize("name", [each.name for each in fields(EpisodeConditions)])
+def test_runs_under_another_condition_are_not_compared_unasked(name: str) -> None:
+    other = {"mode": "live", "composition": "blend", "takeover": "expert"}.get(name, 2)
+    runs = [summary(plan, [ended(0)[1]]) for plan in (PLAN, {**PLAN, name: other})]
+    a, b = (read_run(json.dumps(each).encode(), "") for each in runs)
+    with pytest.raises(RecordError, match=f"--differ {name}"):
+        compare(a, b)
+
+
+def test_runs_of_another_benchmark_or_its_options_are_not_compared_unasked() -> None:
+    for name, other in (("benchmark", "another"), ("benchmark_options", {"size": "96"})):
+        runs = [summary(plan, [ended(0)[1]]) for plan in (PLAN, {**PLAN, name: other})]
+        a, b = (read_run(json.dumps(each).encode(), "") for each in runs)
+        with pytest.raises(RecordError, match=f"--differ {name}"):
+            compare(a, b)
 
 
 # -- processes that die -----------------------------------------------------------------------

@@ -16,10 +16,10 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from vla_zenoh.errors import RecordError, describe_fault
 from vla_zenoh_benchmarks.statistics import ALPHA, Paired, paired
 
-"""Significance level, as in the intervals at 95 %."""
 CONDITIONS = (
     *("mode", "replan", "profile", "vary", "held_out"),
     *("prompt", "delay_ms", "rate_hz", "limit_s"),
+    *("benchmark", "benchmark_options", "composition", "takeover", "disagreement"),
 )
 """What influences the success rate beside the model and its options."""
 
@@ -63,6 +63,11 @@ class TaskResultFile(_Read):
     delay_ms: float
     rate_hz: float | None = None
     limit_s: float = 0.0
+    benchmark: str = ""
+    benchmark_options: dict[str, str] = Field(default_factory=dict)
+    composition: str = ""
+    takeover: str = ""
+    disagreement: float = 0.0
     all: tuple[PairedOutcome, ...]
 
     def by_task(self) -> dict[Task, PairedOutcome]:
@@ -216,8 +221,10 @@ def _shown(run: TaskResultFile) -> Mapping[str, Any]:
 
 
 def _shown_value(value: Any) -> str:
-    if value is None or value == ():
+    if value in (None, (), {}, ""):
         return "not set"
+    if isinstance(value, dict):
+        return ", ".join(f"{name}={given}" for name, given in value.items())
     if isinstance(value, tuple):
         return "+".join(value)
     return f"{value:g}" if isinstance(value, float) else str(value)
