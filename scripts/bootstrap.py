@@ -30,12 +30,14 @@ PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.to
 
 LARGE = "vla-zenoh-view"
 """The plug-in whose library unpacks to 500 MB: only `EVERYTHING` has it."""
+ALL = "all"
+"""The extra with which the packages of ``plugins/`` come; a choice of other extras has none."""
 
 OLDEST_PYTHON = (3, 11)
 OLDEST_UV = (0, 8)
 
 EVERYTHING = "all,dev"
-SIZES_GB = {EVERYTHING: 2.7, "brick,sim": 1.5}
+SIZES_GB = {EVERYTHING: 2.7, "brick,sim": 1.4}
 
 OPENMP = "libgomp.so.1"
 """Pinocchio needs it and no wheel of ours brings it; a bare Debian has no package that does."""
@@ -183,6 +185,13 @@ def install_uv() -> Path:
     return UV_IN_FOLDER
 
 
+def plugins_of(extras: str) -> list[Path]:
+    """Packages of ``plugins/`` that are installed with these extras."""
+    if ALL not in extras.split(","):
+        return []
+    return [path for path in PLUGINS if extras == EVERYTHING or path.name != LARGE]
+
+
 def make_venv(uv: Path) -> None:
     """An environment of this interpreter at ./.venv, unless a usable one is there."""
     code = f"import sys; sys.exit(sys.version_info[:2] != {tuple(sys.version_info[:2])!r})"
@@ -215,8 +224,7 @@ def main() -> None:
     say(f"installing the package with the extras {extras} into .venv{size}")
     quiet = [] if sys.stderr.isatty() else ["--quiet"]
     target = ["--python", VENV / "bin" / "python", "--constraint", CONSTRAINTS]
-    plugins = [path for path in PLUGINS if extras == EVERYTHING or path.name != LARGE]
-    packages = [f".[{extras}]", *map(str, plugins)]
+    packages = [f".[{extras}]", *map(str, plugins_of(extras))]
     editable = [word for package in packages for word in ("--editable", package)]
     run(uv, *quiet, "pip", "install", *target, *editable)
     bring_openmp(uv, VENV / "bin" / "python")

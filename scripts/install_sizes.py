@@ -1,7 +1,8 @@
-"""Sizes of an install, by what it is for: ``python scripts/install_sizes.py``.
+"""Sizes of an install, by what it is for: ``python scripts/install_sizes.py [WORD ...]``.
 
 Each row is installed into an empty environment by uv, with the versions of constraints.txt, and
-asked for its version. A model with packages of its own adds its own environment.
+asked for its version; with words only the rows that have one of them. A model with packages of its
+own adds its own environment.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ ROWS = {
     "model host, shipped policy": ("brick,secure",),
     "robot host": ("control,record,secure",),
     "robot host, ROS 2": ("record,secure", "vla-zenoh-ros2"),
+    "the demo, as `make demo` has it": ("brick,sim",),
     "simulator and everything in the tutorial": ("all",),
     "the same with the viewer": ("all", "vla-zenoh-view"),
 }
@@ -57,7 +59,10 @@ def measure(extras: str, packages: Sequence[str], folder: Path) -> tuple[float, 
 def main() -> None:
     """Prints the table."""
     print("| for | extras | MB | largest |\n|---|---|---|---|")
+    words = sys.argv[1:] or [""]
     for purpose, (extras, *packages) in ROWS.items():
+        if not any(word in purpose for word in words):
+            continue
         with tempfile.TemporaryDirectory(prefix="vla-zenoh-size-") as name:
             size, largest = measure(extras, packages, Path(name) / "venv")
         label = ", ".join(f"`{each}`" for each in (extras, *packages) if each) or "none"

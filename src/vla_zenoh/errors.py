@@ -7,6 +7,8 @@ these at the edge, with ``from``.
 from __future__ import annotations
 
 import difflib
+import importlib.metadata
+import json
 import re
 import reprlib
 from collections.abc import Iterable
@@ -70,11 +72,24 @@ def how_to_install(extra: str = "", package: str = "", needed: Iterable[str] = (
     Never by name alone: the package is on no index, and anyone could register the name there.
     """
     extras = f"[{extra}]" if extra else ""
+    if not package and (wheel := _wheel_url()):
+        what = f"'vla-zenoh{extras} @ {wheel}'"
+        return f"pip install {what}, or in one go: uvx --from {what} vla-zenoh ..."
     this = f"'.{extras}'" if extra and not package else "."
     folders = [f"'./plugins/{other}'" for other in needed]
     folders += [f"'./plugins/{package}{extras}'"] if package else []
     what = " ".join((this, *folders))
     return f"pip install -c constraints.txt {what} in a checkout of vla-zenoh"
+
+
+def _wheel_url() -> str:
+    """Address of the wheel that this package was installed from; empty: it was no wheel."""
+    try:
+        origin = importlib.metadata.distribution("vla-zenoh").read_text("direct_url.json")
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+    url = str(json.loads(origin or "{}").get("url", ""))
+    return url if url.endswith(".whl") else ""
 
 
 class MissingExtraError(VlaZenohError, ImportError):

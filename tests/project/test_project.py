@@ -65,8 +65,12 @@ def test_a_camera_host_gets_no_simulator_and_no_kinematics(project: dict) -> Non
     assert heavy.isdisjoint(map(name_of, project["dependencies"]))
 
 
-def test_the_plug_in_that_a_small_set_up_leaves_out_exists(bootstrap: ModuleType) -> None:
-    assert bootstrap.LARGE in {path.name for path in bootstrap.PLUGINS}
+def test_a_set_up_has_the_packages_that_its_extras_ask_for(bootstrap: ModuleType) -> None:
+    everything = {path.name for path in bootstrap.plugins_of(bootstrap.EVERYTHING)}
+    assert {bootstrap.LARGE, "vla-zenoh-web"} <= everything
+    tutorial = {path.name for path in bootstrap.plugins_of("all")}
+    assert everything - tutorial == {bootstrap.LARGE}
+    assert not bootstrap.plugins_of("brick,sim")
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Annotated
 
 import typer
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, MAX_INDEX, not_empty, options
+from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.lab.cli.options import DemoOptions
 
 DEFAULT_STEPS = 50
 TASK_PROFILE = "panda_bricks"
+NEEDED = ("mujoco", "pinocchio", "ruckig", "mcap", "plotly", "av")
+EXTRAS = "brick,sim"
+"""Extras of the demo; without `sim` nothing of it works."""
 
 
 @options
@@ -36,6 +41,9 @@ def demo(
 
     Exits with 0 only when the arm did what was asked.
     """
+    missing = next((name for name in NEEDED if find_spec(name) is None), None)
+    if missing is not None:
+        raise MissingExtraError(missing, EXTRAS)
     # Imported here: simulation, kinematics and plots take long to load.
     if prompt is not None and prompt.strip().lower().startswith(("hard", "hold")):
         from vla_zenoh.lab.cli.demo_run import run_demo
