@@ -232,8 +232,9 @@ def test_a_stop_buzzes_says_when_the_arm_stood_and_offers_the_reset(chain: Chain
     tab.run(
         "window.felt = []; navigator.vibrate = (pattern) => { felt.push(pattern); return true; }"
     )
-    tab.press("STOP")
-    tab.let_go()
+    for button in ("3-D", "STOP"):  # browsers let no page buzz that was never touched
+        tab.press(button)
+        tab.let_go()
     tab.until("when it stood", lambda: "stood at" in tab.text("stop-words"))
     assert len(tab.run("return felt")) == 2
     tab.until("the banner", lambda: tab.text("what") == "Emergency stop. The arm stands.")

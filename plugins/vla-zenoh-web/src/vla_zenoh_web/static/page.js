@@ -151,7 +151,7 @@ function showState(message) {
   }
   const arms = Object.entries(message.arms || {}), fastest = Math.max(0, ...arms.map(([, arm]) => arm.speed_m_s || 0));
   facts([
-    ["why", message.why.replace(/'web-(.+?)-[0-9a-f]+'/, "$1")],
+    ["why", message.why.replace(/'web-(.+?)-[0-9a-f]+'/g, "$1")],
     ["held by", message.you_hold ? "you" : message.holder ? message.holder : task && task.active ? "nobody: it runs without a hold" : "nobody"],
     ["arm", `${message.at_rest === null ? "unknown" : message.at_rest ? "stands" : "moves"}, ${(fastest * 100).toFixed(1)} cm/s`],
     ...arms.map(([name, arm]) => [`gripper ${name}`.trim(), arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}${arm.holds ? `, counted as a box of ${arm.holds} m` : ""}`]),
@@ -196,6 +196,7 @@ $("leave").addEventListener("click", () => {
   control = pictures = null;
   token = "";
   for (const node of document.querySelectorAll(".drives")) node.disabled = true;
+  $("stop").disabled = true;
   welcome = { drives: false };
   setText($("who"), "");
   askToken("");
@@ -241,7 +242,7 @@ for (const name of ["activate", "deactivate", "reset"])
 // -- stop ---------------------------------------------------------------------------------
 let sound = null;
 function buzz(pattern_ms, hz) { // felt on a phone, heard where nothing can be felt; [on, off, on, ...]
-  if (navigator.vibrate) navigator.vibrate(pattern_ms);
+  if (navigator.vibrate && navigator.userActivation.hasBeenActive) navigator.vibrate(pattern_ms); // else browsers complain
   sound = sound || new AudioContext();
   sound.resume();
   let at = sound.currentTime;
@@ -373,7 +374,7 @@ function showRecording(message) {
 const GUIDE = { // step -> its buttons: words, request, looks
   scene: [["Take", "take", "main"], ["Put the simulated scene back", "scene"], ["Finish now", "finish"], ["Cancel", "cancel"]],
   take: [["End the take", "end", "main"], ["Cancel", "cancel"]],
-  judge: [["It succeeded", "success", "main"], ["It failed", "failure"], ["Does not count", "void"], ["Go on with this take", "again"], ["Cancel", "cancel"]],
+  judge: [["It succeeded", "success", "verdict"], ["It failed", "failure", "verdict"], ["Does not count", "void"], ["Go on with this take", "again"], ["Cancel", "cancel"]],
 };
 let guideStep = "";
 function guide(step) { send({ do: "guide", step, prompt: $("guide-prompt").value, count: Number($("guide-count").value) || 10 }); }
