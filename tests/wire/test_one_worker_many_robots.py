@@ -43,6 +43,8 @@ STATE_HZ = 50.0
 RATE_HZ = 10.0
 SLOW_S = 0.12
 """One inference of a slow model: longer than a request's period, so that requests meet."""
+SLOWER_S, BEHIND_S, OLDEST_S = 0.3, 0.45, 0.6
+"""An inference, and the age of what a robot sends, which together are more than is obeyed."""
 LEAST_SHARE = 0.3
 """Of its rate that a robot must be given on a busy computer; a held-up one gets nothing."""
 START_S = 40.0
@@ -57,6 +59,8 @@ class Robot:
         self.keys = profile.keys
         self.task = Task(1, True, "HARD: go up", worker, RATE_HZ)
         self.silent = False
+        self.behind_s = 0.0
+        """Age of its states when they are sent."""
         self.chunks: list[ActionChunk] = []
         self._session, self._seq = session, 0
         self._subscriber = session.declare_subscriber(
@@ -79,7 +83,9 @@ class Robot:
             (self.keys.state_pose, "sim#1", PoseState(np.array([0.4, 0, z_m]), DOWN, np.zeros(6))),
             (self.keys.state_gripper, "sim#1", GripperState(0.08, False, False)),
         ):
-            header = records.encode_header(Header(time.time_ns(), self._seq, source))
+            behind_s = 0.0 if record is self.task else self.behind_s
+            stamp_ns = time.time_ns() - int(behind_s * 1e9)
+            header = records.encode_header(Header(stamp_ns, self._seq, source))
             self._session.put(key, records.encode(record), attachment=header)
 
     def asked(self, **changes: Any) -> None:
@@ -231,6 +237,29 @@ def test_a_robot_that_falls_silent_or_fails_holds_up_no_other(
         for robot in robots.values():
             until("all again", robot.more(3))
         assert b.chunks[-1].steps[0, 0] == 5.0
+
+
+def test_a_chunk_that_would_come_too_late_is_computed_when_it_keeps_no_other_robot_waiting(
+    profile: Profile, router: None
+) -> None:
+    model = Together(SLOWER_S)
+    oldest = override(profile, {"timing": {"max_observation_age_s": OLDEST_S}})
+    with served(oldest, model) as robots:
+        a, b, c = robots.values()
+        a.behind_s = BEHIND_S
+        for robot in (a, b, c):
+            robot.asked(prompt="1", rate_hz=50.0)
+        until("an inference has shown what it takes", lambda: len(model.batches) > 1)
+        had = len(model.batches)
+        until("the others go on", b.more(8))
+        until("both of them", c.more(8))
+        assert not any("a" in batch for batch in model.batches[had:])
+        b.silent = c.silent = True
+        until("it has its turn", lambda: model.batches[-1] == ("a",))
+        with open_session(profile.session) as session:
+            looker = Client(override(profile, {"robot": {"name": "a"}}), session).subscribe()
+            status = until("its status", lambda: looker.status("worker-together"))
+            assert status.detail["complaint"].startswith("too_late")
 
 
 def test_each_robot_has_its_own_rate(profile: Profile, router: None) -> None:

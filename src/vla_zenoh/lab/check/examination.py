@@ -220,7 +220,9 @@ class Examination:
         if any(steps is None for steps in alone):
             return
         self._reset()
-        seen = [self._maker.make(style, again=True) for style in pair]
+        both = [self._maker.make(style, again=True) for style in pair]
+        # Of two robots: the second must not find what the first one left.
+        seen = [replace(each, robot=name) for each, name in zip(both, "ab", strict=True)]
         try:
             found, _ = self._runner.call(lambda: judge.ask_batch(self._policy, seen))
         except ModelFailed as failed:

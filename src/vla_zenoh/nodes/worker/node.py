@@ -42,7 +42,7 @@ class WorkerNode:
     """Runs one model for one robot or several of a kind, each with a `RobotSession`.
 
     A model with ``infer_batch`` infers for all robots that are ready at once; it does not wait for
-    the others.
+    the others. A robot whose chunk would come too late to be obeyed waits for an idle moment.
 
     Args:
         profile, session: of the robots; the caller closes the session.
@@ -77,6 +77,8 @@ class WorkerNode:
         self._infer_batch: Callable[..., Any] | None = getattr(policy, "infer_batch", None)
         max_batch = getattr(policy, "max_batch", None) or max(len(robots), 1)
         self._max_batch: int = 1 if self._infer_batch is None else max_batch
+        self._took_s = 0.0
+        """The last inference."""
         self._policies = [policy]
         if len(robots) > 1:
             self._policies = self._one_for_each(policy, len(robots), another)
@@ -152,16 +154,23 @@ class WorkerNode:
             self._wait(due, stop)
 
     def _observe(self, due: Sequence[RobotSession]) -> list[Ready]:
-        """Robots that are due and have a new observation, as many as fit one inference."""
+        """Robots that are due and have a new observation, as many as fit one inference; those
+        whose chunk would come too late only where that keeps no other waiting."""
         ready: list[Ready] = []
+        late: list[Ready] = []
         for robot in due:
             if len(ready) == self._max_batch:
                 robot.poll()
                 continue
             observation = robot.observe()
             if observation is not None:
-                ready.append((robot, observation, robot.node.clock.wall_ns()))
-        return ready
+                now_ns = robot.node.clock.wall_ns()
+                in_time = robot.in_time(observation, now_ns, self._took_s)
+                (ready if in_time else late).append((robot, observation, now_ns))
+        ends_s = time.monotonic() + self._took_s
+        if ready or any(robot.expects(ends_s) for robot in self.sessions):
+            return ready
+        return late[: self._max_batch]
 
     def _wait(self, due: Sequence[RobotSession], stop: threading.Event) -> None:
         """Sleep until a robot is due or has sent its images, but only for a little while."""
@@ -189,6 +198,7 @@ class WorkerNode:
         answers = self._answers(ready)
         if self._delay_s:
             time.sleep(self._delay_s)
+        self._took_s = time.monotonic() - began_s
         published: list[Any] = []
         for (robot, observation, observed_ns), answer in zip(ready, answers, strict=True):
             robot.due_s = max(robot.due_s + 1.0 / observation.task.requested_hz, began_s)

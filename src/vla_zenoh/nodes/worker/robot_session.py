@@ -53,6 +53,7 @@ PATIENCE_S, PERIODS = 1.0, 3
 """Without images on the preferred stream for this long, and for this many periods of a slow camera,
 a worker subscribes to the common one as well."""
 MAX_COMPLAINT = 500
+TOO_LATE = "too_late"
 
 
 class RobotSession:
@@ -206,6 +207,23 @@ class RobotSession:
             if min(camera.received_s for camera in self._cameras) < self.due_s - tolerance_s:
                 return None
         return observation
+
+    def in_time(self, observation: Observation, now_ns: int, takes_s: float) -> bool:
+        """Whether the command node would accept the chunk of an inference that begins now (wall
+        clock) and takes `takes_s`; the reason is in `complaint` if not."""
+        age_s = (now_ns - observation.stamp_wall_ns) / 1e9 + takes_s
+        oldest_s = self.node.profile.timing.max_observation_age_s
+        if age_s > oldest_s:
+            self.complaint = (
+                f"{TOO_LATE}: its observation would be {age_s:.2f} s old when the chunk is there; "
+                f"timing.max_observation_age_s is {oldest_s:g}"
+            )
+        return age_s <= oldest_s
+
+    def expects(self, by_s: float) -> bool:
+        """Whether it is due by then (monotonic clock), and nothing keeps it from an inference."""
+        asks = self.task is not None and self.task.requested_hz > 0.0
+        return asks and not self.complaint and self.due_s <= by_s
 
     def publish(
         self,
