@@ -15,6 +15,8 @@ import sysconfig
 from pathlib import Path
 
 from bootstrap import TOOLS, uv_environment
+from test_franka import PACKAGES, SIMULATOR
+from test_franka import environment as simulator_environment
 
 ROOT = Path(__file__).resolve().parent.parent
 PHYSICALAI = "PHYSICALAI_PYTHON"
@@ -30,21 +32,38 @@ NEEDED = (
     "pydantic==2.14.4",
     "pyyaml==6.0.4",
 )
+FRANKA_NODE = "FRANKA_NODE_PYTHON"
+"""Environment variable with the Python that has franka-node's client, and the loop of its arms."""
+OF_FRANKA_NODE = (
+    "eclipse-zenoh==1.10.2",
+    "franka-node-client==0.4.0",
+    "franka-rs==0.4.0",
+    "numpy==2.4.6",
+)
 
 
-def environment(uv: str, environ: dict[str, str]) -> str:
-    """Make the environment of physicalai unless it is there; its Python."""
-    folder = TOOLS / "rivals" / "physicalai"
+def environment(
+    uv: str, environ: dict[str, str], name: str, alone: tuple[str, ...], needed: tuple[str, ...]
+) -> str:
+    """Make an environment unless it is there; its Python.
+
+    Args:
+        uv: its path.
+        environ: what it runs in.
+        name: of the folder.
+        alone: packages without what they need.
+        needed: packages with that.
+    """
+    folder = TOOLS / "rivals" / name
     python, ready = folder / "bin" / "python", folder / "ready"
-    told = "\n".join((*ALONE, *NEEDED))
+    told = "\n".join((*alone, *needed))
     if not ready.is_file() or ready.read_text() != told:
         install = [uv, "--quiet", "pip", "install", "--python", str(python)]
-        for command in (
-            [uv, "--quiet", "venv", "--clear", "--python", sys.executable, str(folder)],
-            [*install, "--no-deps", *ALONE],
-            [*install, *NEEDED],
-        ):
-            subprocess.run(command, env=environ, check=True)
+        venv = [uv, "--quiet", "venv", "--clear", "--python", sys.executable, str(folder)]
+        subprocess.run(venv, env=environ, check=True)
+        if alone:
+            subprocess.run([*install, "--no-deps", *alone], env=environ, check=True)
+        subprocess.run([*install, *needed], env=environ, check=True)
         ready.write_text(told)
     return str(python)
 
@@ -54,7 +73,11 @@ def main() -> int:
     environ = uv_environment(os.environ)
     uv = str(Path(sysconfig.get_path("scripts")) / "uv")
     if PHYSICALAI not in environ:
-        environ[PHYSICALAI] = environment(uv, environ)
+        environ[PHYSICALAI] = environment(uv, environ, "physicalai", ALONE, NEEDED)
+    if FRANKA_NODE not in environ:
+        environ[FRANKA_NODE] = environment(uv, environ, "franka-node", (), OF_FRANKA_NODE)
+    if SIMULATOR not in environ:
+        environ[SIMULATOR] = simulator_environment(uv, environ, *PACKAGES)
     command = [sys.executable, "-m", "pytest", "-m", "rivals", "tests/rivals", *sys.argv[1:]]
     return subprocess.run(command, cwd=ROOT, env=environ, check=False).returncode
 

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
+from vla_zenoh_franka_node import wire as franka_node
 from vla_zenoh_mcp import protocol
 from vla_zenoh_policy_servers import message as arrays
 from vla_zenoh_primitives.requests import decode_request
@@ -97,6 +98,15 @@ class Target(NamedTuple):
 
 
 # -- what is not one function ---------------------------------------------------------------------
+def _franka_node(data: bytes) -> Any:
+    """By its size, as the driver knows it by its key."""
+    readers = {474: franka_node.decode_state, 40: franka_node.decode_gripper_state}
+    return readers.get(len(data), franka_node.decode_reply)(data)
+
+
+_FRANKA_NODE = [bytes([1]) + bytes(473), bytes([1]) + bytes(39), b'{"ok":false,"error":"no lease"}']
+
+
 def _raw(data: bytes) -> Any:
     words, _, pixels = data.partition(b"\n")
     return image.decode_raw(pixels, words.decode("latin-1"))
@@ -442,6 +452,7 @@ def _targets() -> Iterator[Target]:
         peer,
         lambda: [lerobot_server.policy_setup(OF_TORCH.read_bytes())],
     )
+    yield Target("franka-node", _franka_node, codec, lambda: _FRANKA_NODE)
     yield Target("npy", npy.load, peer, lambda: [npy.dump(np.zeros((2, 3)))])
     yield Target(
         "openvla-rest",

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import os
 
+import franka_node_rig
+import physicalai_rig
 import pytest
-from physicalai_rig import VARIABLE
+
+NEEDS = {"test_physicalai": physicalai_rig.VARIABLE, "test_franka_node": franka_node_rig.VARIABLE}
+"""Beginning of a file's name -> environment variable."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if item.path.parent.name == "rivals":
-            item.add_marker(pytest.mark.rivals)
-            item.add_marker(pytest.mark.realtime)
-            if VARIABLE not in os.environ:
-                item.add_marker(pytest.mark.skip(reason="needs make test-rivals"))
+        if item.path.parent.name != "rivals":
+            continue
+        item.add_marker(pytest.mark.rivals)
+        item.add_marker(pytest.mark.realtime)
+        (needed,) = (name for file, name in NEEDS.items() if item.path.name.startswith(file))
+        if needed not in os.environ:
+            item.add_marker(pytest.mark.skip(reason="needs make test-rivals"))

@@ -13,11 +13,11 @@ SCRIPT = Path(__file__).with_name("physicalai_peer_process.py")
 
 
 class Process:
-    """The owner or a client of robot `name`."""
+    """What plays a role of others, by a script in their environment."""
 
-    def __init__(self, role: str, name: str) -> None:
+    def __init__(self, *given: str, python: str = "", script: Path = SCRIPT) -> None:
         self._process = subprocess.Popen(
-            [os.environ[VARIABLE], str(SCRIPT), role, name],
+            [python or os.environ[VARIABLE], str(script), *given],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -38,9 +38,15 @@ class Process:
         self._in.flush()
         return json.loads(self.line())
 
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
     def kill(self) -> None:
         self._process.kill()
         self._process.wait()
+        self._in.close()
+        self._out.close()
 
     def __enter__(self) -> Self:
         return self

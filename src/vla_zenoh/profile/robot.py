@@ -89,9 +89,9 @@ class RobotProfile(Section):
         driver: name of an installed plug-in: ``sim``: simulator; ``ros2``: controllers of a ROS 2
             robot; ``arm``: a Python file; ``franka``: a Franka arm over FCI; ``ur``: a UR arm over
             RTDE; ``lerobot``: a robot class of LeRobot; ``physicalai``: a robot that Intel's
-            physicalai owns; packages bring more. What it needs to know is in the section of its
-            name. The node of ``sim`` and ``ros2`` has their name, that of
-            all others is ``arm``.
+            physicalai owns; ``franka_node``: a Franka arm behind franka-node; packages bring more.
+            What it needs to know is in the section of its name. The node of ``sim`` and ``ros2``
+            has their name, that of all others is ``arm``.
         command: set-points of the arm: ``pose`` of the TCP, for a Cartesian impedance controller,
             or ``joint`` positions.
         description: path of the URDF, or ``example-robot-data:`` and a path in that package.

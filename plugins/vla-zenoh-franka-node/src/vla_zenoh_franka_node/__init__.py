@@ -1,0 +1,1 @@
+"""Franka arms behind franka-node, for vla-zenoh."""
