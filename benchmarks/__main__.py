@@ -6,6 +6,7 @@ import sys
 
 import typer
 
+from benchmarks.arms import arms
 from benchmarks.chain.cli import chain
 from benchmarks.codec.cli import codec
 from benchmarks.delay import delay
@@ -30,6 +31,7 @@ app = typer.Typer(
     add_completion=False,
 )
 COMMANDS = (
+    arms,
     chain,
     codec,
     delay,

@@ -84,6 +84,15 @@ def test_a_made_profile_moves_its_simulated_arm(tmp_path: Path, name: str) -> No
     assert ways_m == pytest.approx([WAY_M, -WAY_M], abs=EXACT_M)
 
 
+def test_an_arm_whose_description_has_weak_motors_does_not_fall(tmp_path: Path) -> None:
+    weak = urdf(TAKEN["six joints"].rows).replace('effort="10"', 'effort="0.01"')
+    code, output, file = new(tmp_path, weak)
+    assert code == 0, output
+    why, ways_m = moved_m(load_profile(str(file)))
+    assert why == ""
+    assert ways_m == pytest.approx([WAY_M, -WAY_M], abs=EXACT_M)
+
+
 @pytest.mark.parametrize("name", sorted(REFUSED))
 def test_a_joint_that_follows_one_of_the_arm_is_refused_by_name(tmp_path: Path, name: str) -> None:
     code, output, _ = new(tmp_path, urdf(TAKEN[name].rows))

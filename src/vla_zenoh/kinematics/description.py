@@ -38,7 +38,7 @@ COMPRESSED = (b"\x1f\x8b", b"PK\x03\x04", b"BZh", b"\xfd7zXZ")
 WORLD = "universe"
 """What Pinocchio calls that which does not move."""
 TO_URDF = {
-    "mujoco": "MJCF, the format of MuJoCo: give the maker's URDF",
+    "mujoco": "MJCF, the format of MuJoCo: `vla-zenoh profile new` makes a URDF of it",
     "sdf": "SDF, the format of Gazebo: give the maker's URDF",
     "COLLADA": "a mesh (COLLADA): give the URDF that names it",
     "srdf": "an SRDF, which only adds to a description: give the URDF",

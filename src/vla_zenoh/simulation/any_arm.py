@@ -70,6 +70,9 @@ def arm_spec(kinematics: Kinematics, fingers: Sequence[str]) -> mujoco.MjSpec:
         )
     for index, name in enumerate(kinematics.arm_joints):
         spec.joint(name).range = kinematics.lower_rad[index], kinematics.upper_rad[index]
+    for name in moving:
+        # Of the effort of a description, which is often made up, an arm would fall.
+        spec.joint(name).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     return spec
 
 

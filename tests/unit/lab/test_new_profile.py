@@ -116,7 +116,7 @@ def mended(folder: Path, text: str) -> tuple[Description, Mended]:
     """The description that is saved for this one, and how it was mended."""
     source = folder / "arm.urdf"
     source.write_text(text)
-    made = Mended(source, {})
+    made = Mended(source, {}, folder)
     made.described()
     made.give_ends(JOINTS_6)
     return Description(made.save(folder / "copy.urdf")), made
@@ -187,7 +187,7 @@ def test_a_xacro_is_expanded(tmp_path: Path) -> None:
     argument = '<xacro:arg name="high" default="0.1"/>'
     text = urdf([*arm(SIX), TOOL]).replace('name="made">', f'name="made" {space}>{argument}', 1)
     source.write_text(text.replace('xyz="0.0 0.0 0.1"', 'xyz="0 0 $(arg high)"'))
-    made = Mended(source, {"high": "0.3"})
+    made = Mended(source, {"high": "0.3"}, tmp_path)
     assert made.described().joints["tool"].offset_m == (0.0, 0.0, 0.3)
     assert "expanded" in made.changes[0]
 
@@ -195,7 +195,7 @@ def test_a_xacro_is_expanded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("<mujoco/>", "is MJCF, the format of MuJoCo: give the maker's URDF"),
+        ("<mujoco/>", "has no joint that moves"),
         ("robot", "is no XML"),
         ('<robot name="a"><link name="a"/></robot>', "has no joint that moves"),
         (
@@ -209,7 +209,7 @@ def test_what_is_no_arm_is_refused_by_name(tmp_path: Path, text: str, says: str)
     source = tmp_path / "arm.urdf"
     source.write_text(text)
     with pytest.raises(ProfileError, match=says.replace("(", r"\(")):
-        structure(Mended(source, {}).described(), None, None)
+        structure(Mended(source, {}, tmp_path).described(), None, None)
 
 
 # -- who answers ----------------------------------------------------------------------------------

@@ -54,6 +54,11 @@ class Arm(NamedTuple):
     guesses: Sequence[Guess]
 
 
+def meshes_of(copy: Path) -> Path:
+    """Folder beside a mended description for its meshes."""
+    return copy.with_name(f"{copy.stem}_meshes")
+
+
 def found_arm(source: Path, copy: Path, arguments: Mapping[str, str], answers: Answers) -> Arm:
     """The arm of a description.
 
@@ -67,7 +72,7 @@ def found_arm(source: Path, copy: Path, arguments: Mapping[str, str], answers: A
         ResourceError: the description, or its shapes, cannot be read.
         ProfileError: no arm is found in it, or an answer does not fit; says what to do.
     """
-    description = Mended(source, arguments)
+    description = Mended(source, arguments, meshes_of(copy))
     links = _structure(description, answers)
     description.give_ends([*links.arm, *links.fingers])
     file = description.save(copy)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.resources import ROBOT_DATA_PREFIX, robot_urdf
 from vla_zenoh_newarm.answers import Answers
-from vla_zenoh_newarm.arm import Arm, found_arm
+from vla_zenoh_newarm.arm import Arm, found_arm, meshes_of
 from vla_zenoh_newarm.profile_text import profile_text
 
 
@@ -64,7 +65,7 @@ class Given:
 @options
 def new(
     description: Annotated[
-        str, typer.Argument(help="URDF or xacro of the arm, or example-robot-data:PATH.")
+        str, typer.Argument(help="URDF, xacro or MJCF of the arm, or example-robot-data:PATH.")
     ],
     given: Given,
     output: Annotated[
@@ -91,13 +92,16 @@ def new(
     file = output or Path(f"{name}.yaml")
     copy = file.with_name(f"{file.stem}_mended.urdf")
     with output_file(file, force=force, inputs=[source]) as part:
-        if copy.exists() and not force:
-            raise OutputError(f"{copy} exists; give another --output, or --force to replace it")
+        for made in (copy, meshes_of(copy)):
+            if made.exists() and not force:
+                raise OutputError(f"{made} exists; give another --output, or --force to replace it")
+        shutil.rmtree(meshes_of(copy), ignore_errors=True)
         answers = Answers(vars(given), ask=sys.stdin.isatty() and not yes)
         try:
             arm = found_arm(source, copy, model_options(settings or []), answers)
         except VlaZenohError:
             copy.unlink(missing_ok=True)
+            shutil.rmtree(meshes_of(copy), ignore_errors=True)
             raise
         named = description if arm.file == source and _is_named(description) else ""
         path = named or os.path.relpath(arm.file.resolve(), file.resolve().parent)

@@ -1,4 +1,4 @@
-"""A robot description (URDF or xacro) with what this package needs and descriptions often lack.
+"""A robot description (URDF, xacro or MJCF) with what we need and descriptions often lack.
 
 Endless joints get ends, joints without a velocity get one, meshes that cannot be found are replaced
 by plain shapes. What was changed is said; a description that lacks nothing is used as it is.
@@ -32,11 +32,12 @@ MESHES = (".stl", ".dae", ".obj")
 
 
 class Mended:
-    """A description that can be used, of a URDF or a xacro.
+    """A description that can be used, of a URDF, a xacro or an MJCF.
 
     Args:
         source: the file.
         arguments: of a xacro.
+        meshes: folder for the meshes of an MJCF.
 
     Attributes:
         changes: what was changed and is no guess, as sentences.
@@ -47,11 +48,20 @@ class Mended:
         ProfileError: it is none, or not one robot; says what to do.
     """
 
-    def __init__(self, source: Path, arguments: Mapping[str, str]) -> None:
+    def __init__(self, source: Path, arguments: Mapping[str, str], meshes: Path) -> None:
         self.source = source
-        expanded = _expanded(source, arguments)
-        self._robot = _robot(source) if expanded is None else ElementTree.fromstring(expanded)
-        self.changes = [] if expanded is None else [f"{source.name} is a xacro: it was expanded"]
+        root = _root(source)
+        self.changes: list[str] = []
+        if root is not None and root.tag == "mujoco":
+            from vla_zenoh_newarm.mjcf import FromMjcf
+
+            made = FromMjcf(source, meshes)
+            self._robot, self.changes = made.robot, made.changes
+        elif root is not None and is_xacro(root):
+            self._robot = _expanded(source, arguments)
+            self.changes.append(f"{source.name} is a xacro: it was expanded")
+        else:
+            self._robot = _robot(source, root)
         self.guesses = [*_give_velocities(self._robot), *_give_shapes(self._robot, source)]
 
     def described(self) -> Description:
@@ -82,30 +92,28 @@ class Mended:
         path.write_text(ElementTree.tostring(self._robot, encoding="unicode"), "utf-8")
 
 
-def _robot(source: Path) -> ElementTree.Element:
+def _root(source: Path) -> ElementTree.Element | None:
+    """The outermost element of a file; None: there is none, and the reader of URDFs says why."""
     try:
-        found = ElementTree.parse(source).getroot()
+        return ElementTree.parse(source).getroot()
     except (OSError, ElementTree.ParseError):
-        found = None
-    if found is None or found.tag != "robot":
+        return None
+
+
+def _robot(source: Path, root: ElementTree.Element | None) -> ElementTree.Element:
+    if root is None or root.tag != "robot":
         Description(source)  # says what it is instead
         raise ProfileError(f"{source.name} is no URDF")
-    return found
+    return root
 
 
-# -- xacro ----------------------------------------------------------------------------------------
-def _expanded(source: Path, arguments: Mapping[str, str]) -> str | None:
-    """The URDF that a xacro stands for; None: it is no xacro."""
-    try:
-        if not is_xacro(ElementTree.parse(source).getroot()):
-            return None
-    except (OSError, ElementTree.ParseError):
-        return None  # the reader of descriptions says why
+def _expanded(source: Path, arguments: Mapping[str, str]) -> ElementTree.Element:
+    """The URDF that a xacro stands for."""
     try:
         from xacrodoc import XacroDoc
 
         made = XacroDoc.from_file(str(source), subargs=dict(arguments))
-        return str(made.to_urdf_string(use_protocols=False))
+        return ElementTree.fromstring(str(made.to_urdf_string(use_protocols=False)))
     except Exception as error:
         raise ProfileError(
             f"{source.name} is a xacro and cannot be expanded: {in_words(error)}. Give its "
