@@ -40,6 +40,9 @@ OF_FRANKA_NODE = (
     "franka-rs==0.4.0",
     "numpy==2.4.6",
 )
+R2C = "R2C_PYTHON"
+"""Environment variable with the Python that has R2C's client."""
+OF_R2C = ("hw-cloudrobo-r2c[client]==0.2.1",)
 
 
 def environment(
@@ -76,6 +79,8 @@ def main() -> int:
         environ[PHYSICALAI] = environment(uv, environ, "physicalai", ALONE, NEEDED)
     if FRANKA_NODE not in environ:
         environ[FRANKA_NODE] = environment(uv, environ, "franka-node", (), OF_FRANKA_NODE)
+    if R2C not in environ:
+        environ[R2C] = environment(uv, environ, "r2c", (), OF_R2C)
     if SIMULATOR not in environ:
         environ[SIMULATOR] = simulator_environment(uv, environ, *PACKAGES)
     command = [sys.executable, "-m", "pytest", "-m", "rivals", "tests/rivals", *sys.argv[1:]]

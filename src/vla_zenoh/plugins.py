@@ -198,6 +198,7 @@ PACKAGES: Mapping[str, str] = {
     "secure.show": "vla-zenoh-secure",
     "serve.mcp": "vla-zenoh-mcp",
     "serve.policy": "vla-zenoh-serve",
+    "serve.r2c": "vla-zenoh-r2c",
     "teleop": "vla-zenoh-teleop",
     "trial": "vla-zenoh-trial",
     "view": "vla-zenoh-view",

@@ -33,6 +33,7 @@ ELSEWHERE = {
     "openvla_rest",
     "origami",
     "physicalai_client",
+    "r2c_policy",
     "xpolicylab",
 }
 """They need weights, a server or a client: tested with those, by themselves."""

@@ -19,12 +19,14 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import r2c_peer
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
 from vla_zenoh_franka_node import wire as franka_node
 from vla_zenoh_mcp import protocol
 from vla_zenoh_policy_servers import message as arrays
 from vla_zenoh_primitives.requests import decode_request
+from vla_zenoh_r2c import wire as r2c
 from vla_zenoh_ros2 import readers
 from vla_zenoh_ros2.bridge_view import read_view
 from vla_zenoh_ros2.keys import Attachment
@@ -475,6 +477,13 @@ def _targets() -> Iterator[Target]:
             )
         ],
     )
+    yield Target(
+        "r2c-observation",
+        r2c.decode_observation,
+        codec,
+        lambda: [r2c_peer.observation([0.1] * 6)],
+    )
+    yield Target("r2c-actions", r2c.decode_actions, codec, lambda: [r2c_peer.actions([[0.1] * 6])])
     # -- ROS 2
     yield Target(
         "ros2-attachment", Attachment.decode, codec, lambda: [bytes(16) + b"\x10" + bytes(16)]

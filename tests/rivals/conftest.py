@@ -7,8 +7,13 @@ import os
 import franka_node_rig
 import physicalai_rig
 import pytest
+import r2c_rig
 
-NEEDS = {"test_physicalai": physicalai_rig.VARIABLE, "test_franka_node": franka_node_rig.VARIABLE}
+NEEDS = {
+    "test_physicalai": physicalai_rig.VARIABLE,
+    "test_franka_node": franka_node_rig.VARIABLE,
+    "test_r2c": r2c_rig.VARIABLE,
+}
 """Beginning of a file's name -> environment variable."""
 
 
