@@ -142,8 +142,10 @@ def _try(arm: PublicArm, packages: Path) -> Tried:
         if done.exit_code == 0:
             guesses = len(json.loads(done.stdout)["guesses"])
             done = CliRunner().invoke(app, ["profile", "check", str(file), "--sim"])
-        joints = len(load_profile(str(file)).robot.arm_joints) if file.exists() else 0
-        fault = _moved(file) if done.exit_code == 0 else " ".join(done.output.split())
+        if done.exit_code != 0:
+            fault = " ".join(f"{done.output} {done.exception}".split())
+            return Tried(0, guesses, time.monotonic() - began, fault)
+        joints, fault = len(load_profile(str(file)).robot.arm_joints), _moved(file)
     return Tried(joints, guesses, time.monotonic() - began, fault)
 
 

@@ -84,6 +84,13 @@ def test_a_made_profile_moves_its_simulated_arm(tmp_path: Path, name: str) -> No
     assert ways_m == pytest.approx([WAY_M, -WAY_M], abs=EXACT_M)
 
 
+def test_an_arm_that_reaches_further_than_a_workspace_may_gets_the_largest(tmp_path: Path) -> None:
+    rows = [row._replace(at_m=(0.0, 0.0, 5 * row.at_m[2])) for row in TAKEN["six joints"].rows]
+    code, output, file = new(tmp_path, urdf(rows))
+    assert code == 0, output
+    assert load_profile(str(file)).limits.workspace.z_m[1] == 3.0
+
+
 def test_an_arm_whose_description_has_weak_motors_does_not_fall(tmp_path: Path) -> None:
     weak = urdf(TAKEN["six joints"].rows).replace('effort="10"', 'effort="0.01"')
     code, output, file = new(tmp_path, weak)

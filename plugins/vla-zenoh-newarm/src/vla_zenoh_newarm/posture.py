@@ -11,6 +11,7 @@ from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.kinematics.kinematics import InverseKinematics, Kinematics, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import POSE_JOINTS, ReachLimits
+from vla_zenoh.profile.limits import REACH_M
 from vla_zenoh.types import FloatArray
 
 SAMPLES = 1000
@@ -78,6 +79,7 @@ def posture(kinematics: Kinematics, reach: ReachLimits, home_rad: Sequence[float
     edges = np.quantile(places_m, (1 - REACH_SHARE, REACH_SHARE), axis=0)
     lower = np.minimum(np.floor(edges[0] * 20) / 20, at_m - MARGIN_M)
     upper = np.maximum(np.ceil(edges[1] * 20) / 20, at_m + MARGIN_M)
+    lower, upper = np.maximum(lower, -REACH_M), np.minimum(upper, REACH_M)
     if reach.table_z_m is not None:
         lower[2] = min(max(lower[2], table_m + ABOVE_M), float(at_m[2]) - ABOVE_M)
     x, y, z = zip(np.round(lower, 3).tolist(), np.round(upper, 3).tolist(), strict=True)
