@@ -20,7 +20,7 @@ import franka_node_peer as peer
 import pytest
 import zenoh
 from camera_rig import free_endpoint, until
-from franka_node_rig import FrankaProcess, node
+from franka_node_rig import Client, FrankaProcess, node
 from physicalai_rig import Process
 from vla_zenoh_franka_node import wire
 
@@ -37,7 +37,7 @@ APART_M, APART_RAD = 0.01, 0.03
 IN_MOTION_S, STANDS_S, STANDS_M_S = 1.2, 1.0, 0.002
 LATEST_S = 8.0
 
-pytestmark = [pytest.mark.timeout(170), pytest.mark.slow]
+pytestmark = pytest.mark.timeout(170)
 
 
 class Watch:
@@ -170,3 +170,20 @@ def test_the_router_killed_ends_our_node(lab: Lab) -> None:
     lab.router.kill()
     lost = lab.told("lost")
     print(f"lost after {lost['at_s'] - since_s:.2f} s: {lost['why']}")
+
+
+def test_its_client_is_refused_and_then_stops_the_arm(lab: Lab) -> None:
+    with Client(lab.endpoint, "fr3") as client:
+        lab.start()
+        lab.in_motion()
+        told = client.ask(verb="acquire")
+        assert told["said"].startswith("held by ")
+        assert "not the holder" in client.ask(verb="drive")["said"]
+        assert told["phase"] == "active"
+        since_s = time.monotonic()
+        told = client.ask(verb="stop")
+        fault = lab.told("fault")
+        assert "somebody asked it to stop" in fault["why"]
+        print(f"its stop was told after {fault['at_s'] - since_s:.2f} s")
+        print(f"arm stood after {lab.watch.stood(since_s)}")
+        assert told["said"] == "ok"
