@@ -16,7 +16,7 @@ import json
 import math
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,7 +35,7 @@ from vla_zenoh.policy import (
 )
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.options import one_of
-from vla_zenoh.types import PoseState
+from vla_zenoh.types import PoseState, Task
 
 FloatArray = NDArray[np.float64]
 
@@ -101,6 +101,11 @@ class Hand:
     swept_m: float = 0.0
     down_m: FloatArray | None = None
 
+    @property
+    def start(self) -> FloatArray:
+        """(4,) x, y, z in m and the turn in rad."""
+        return np.append(self.position_m, self.yaw_rad)
+
     def numbers(self) -> FloatArray:
         """(9,) the network's input for it."""
         x, y, z = self.position_m
@@ -117,6 +122,36 @@ class Hand:
                 float(self.down_m is not None),
             ]
         )
+
+
+class Question(NamedTuple):
+    """What the network is asked for one robot.
+
+    Args:
+        observation: now.
+        hand: now.
+        given: (H, 6) waypoints that can no longer change, as in `Waypoints`, relative to the hand:
+            the offset, 1 for open, and 1 for a row that is given.
+    """
+
+    observation: Observation
+    hand: Hand
+    given: FloatArray
+
+
+@dataclass(slots=True)
+class Memory:
+    """What is remembered of a robot in an episode.
+
+    Args:
+        hand: at its last observation.
+        prompt: of that.
+        asked: when its last chunk was asked for (wall ns), and the (H, 4) goals that it requested.
+    """
+
+    hand: Hand | None = None
+    prompt: str = ""
+    asked: tuple[int, FloatArray] | None = None
 
 
 def words_of(prompt: str) -> list[str]:
@@ -188,7 +223,7 @@ class Brick:
         self._folder = Path(weights) if weights else FOLDER
         self._threads = int(threads)
         self._session: Any = None
-        self.reset()
+        self._memory: dict[str, Memory] = {}
 
     def load(self) -> None:
         """Read the weights.
@@ -210,26 +245,49 @@ class Brick:
         words = checked(self._folder, WORDS, manifest["sha256"]).decode().split()
         self._vocabulary = {word: index + 2 for index, word in enumerate(words)}
 
-    def reset(self) -> None:
-        """Forget past requests and the hand's history."""
-        self._hand: Hand | None = None
-        self._prompt = ""
-        self._asked: tuple[int, FloatArray] | None = None
+    def reset(self, robot: str = "") -> None:
+        """Forget past requests and the hand's history of a robot; empty: of all."""
+        if robot:
+            self._memory.pop(robot, None)
+        else:
+            self._memory.clear()
 
     def infer(self, observation: Observation, committed: Committed | None = None) -> ActionSteps:
         """The next chunk; it begins with the frozen steps, and the network continues from there."""
-        if observation.prompt != self._prompt:
-            # A completed push belongs to the previous task.
-            self._prompt, self._hand = observation.prompt, None
-        hand = self._hand = self._follow(observation)
-        goal = self._goal(observation, hand)
-        start = np.append(hand.position_m, hand.yaw_rad)
-        frozen = np.zeros((0, 7)) if committed is None else committed.steps[: committed.frozen]
-        given = np.zeros((HORIZON, 6), np.float32)
-        given[: len(frozen), :4] = goal - start + np.cumsum(frozen[:, MOVED], axis=0)
-        given[: len(frozen), 4] = frozen[:, 6] > 0
-        given[: len(frozen), 5] = 1.0
-        waypoints = self.think(observation, hand, given)
+        return self.infer_batch([observation], [committed])[0]
+
+    def infer_batch(
+        self,
+        observations: Sequence[Observation],
+        committed: Sequence[Committed | None] | None = None,
+    ) -> list[ActionSteps]:
+        """The next chunk of each robot, by what is remembered of that one."""
+        prefixes = [
+            np.zeros((0, 7)) if one is None else one.steps[: one.frozen]
+            for one in committed or [None] * len(observations)
+        ]
+        questions: list[Question] = []
+        goals: list[FloatArray] = []
+        for observation, frozen in zip(observations, prefixes, strict=True):
+            memory = self._memory.setdefault(observation.robot, Memory())
+            if observation.prompt != memory.prompt:
+                # A completed push belongs to the previous task.
+                memory.prompt, memory.hand = observation.prompt, None
+            hand = memory.hand = follow(observation, memory.hand)
+            goal = _goal(observation, hand, memory.asked)
+            given = np.zeros((HORIZON, 6), np.float32)
+            given[: len(frozen), :4] = goal - hand.start + np.cumsum(frozen[:, MOVED], axis=0)
+            given[: len(frozen), 4] = frozen[:, 6] > 0
+            given[: len(frozen), 5] = 1.0
+            goals.append(goal)
+            questions.append(Question(observation, hand, given))
+        thought = zip(questions, self.think(questions), goals, prefixes, strict=True)
+        return [self._answer(*each) for each in thought]
+
+    def _answer(
+        self, question: Question, waypoints: Waypoints, goal: FloatArray, frozen: FloatArray
+    ) -> ActionSteps:
+        observation, start = question.observation, question.hand.start
         steps = np.zeros((HORIZON, 7))
         if waypoints.understood:
             steps[: len(frozen)] = frozen
@@ -248,30 +306,20 @@ class Brick:
                 steps[row, 6] = WIDTH_STEP_M if opened else -WIDTH_STEP_M
         if observation.task.active:
             goals = goal + np.cumsum(steps[:, MOVED], axis=0)
-            self._asked = (observation.stamp_wall_ns, goals)
+            self._memory[observation.robot].asked = (observation.stamp_wall_ns, goals)
         read = waypoints.order if waypoints.understood else "no task"
         return ActionSteps(steps.astype(np.float32), raw={"read": read})
 
-    def think(self, observation: Observation, hand: Hand, given: FloatArray) -> Waypoints:
-        """Waypoints by the network.
-
-        Args:
-            observation: now.
-            hand: now.
-            given: (H, 6) waypoints that can no longer change, as in `Waypoints`, relative to the
-                hand: the offset, 1 for open, and 1 for a row that is given.
-                hand: the offset, 1 for open, and 1 for a row that is given.
-        """
-        images = {name: observation.images[name][None] for name in ("front", "wrist")}
-        return self._run(observation.prompt, images, hand, given)
-
-    def _run(
-        self, prompt: str, images: Mapping[str, NDArray[np.uint8]], hand: Hand, given: FloatArray
-    ) -> Waypoints:
+    def think(self, questions: Sequence[Question]) -> list[Waypoints]:
+        """Waypoints of each by the network, whose graph is of one robot."""
         if self._session is None:
             self.load()
+        return [self._think(*question) for question in questions]
+
+    def _think(self, observation: Observation, hand: Hand, given: FloatArray) -> Waypoints:
+        prompt = observation.prompt
         feed = {
-            **images,
+            **{name: observation.images[name][None] for name in ("front", "wrist")},
             "tokens": tokens_of(prompt, self._vocabulary),
             "hand": hand.numbers()[None].astype(np.float32),
             "given": given[None].astype(np.float32),
@@ -289,52 +337,57 @@ class Brick:
     def read(self, prompt: str) -> str:
         """The task of a prompt, as `Waypoints.order`; empty: no task."""
         nothing = {
-            "front": np.zeros((1, FRONT[1], FRONT[0], 3), np.uint8),
-            "wrist": np.zeros((1, WRIST[1], WRIST[0], 3), np.uint8),
+            "front": np.zeros((FRONT[1], FRONT[0], 3), np.uint8),
+            "wrist": np.zeros((WRIST[1], WRIST[0], 3), np.uint8),
         }
-        given = np.zeros((HORIZON, 6))
-        found = self._run(prompt, nothing, Hand(np.zeros(3), 0.0, 0.0), given)
+        seen = Observation(0, 0, Task(0, False, prompt, "", 1.0), nothing)
+        hand = Hand(np.zeros(3), 0.0, 0.0)
+        (found,) = self.think([Question(seen, hand, np.zeros((HORIZON, 6)))])
         return found.order if found.understood else ""
 
-    def _follow(self, observation: Observation) -> Hand:
-        pose, gripper = observation.pose, observation.gripper
-        assert pose is not None
-        assert gripper is not None
-        hand = Hand(np.array(pose.position_m), yaw_of(pose), gripper.width_m)
-        last = self._hand
-        if last is not None:
-            hand.swept_m = last.swept_m
-        if hand.position_m[2] < LOW_M:
-            down_m = None if last is None else last.down_m
-            hand.down_m = hand.position_m[:2] if down_m is None else down_m
-            way_m = float(np.linalg.norm(hand.position_m[:2] - hand.down_m))
-            hand.swept_m = max(hand.swept_m, way_m)
-        elif hand.position_m[2] > UP_M and hand.swept_m < PUSH_WAY_M:
-            hand.swept_m = 0.0
-        return hand
 
-    def _goal(self, observation: Observation, hand: Hand) -> FloatArray:
-        """(4,) x, y, z, yaw requested when the observation was taken."""
-        pose = observation.pose
-        assert pose is not None
-        here = np.append(hand.position_m, hand.yaw_rad)
-        if pose.reference_position_m is not None:
-            here[:3] = pose.reference_position_m
-        # Parts that the command node cut off are not known here; an arm at rest shows them.
-        at_rest = bool(np.linalg.norm(pose.twist[:3]) < AT_REST_M_S)
-        if self._asked is None:
-            return here
-        stamp_ns, goals = self._asked
-        # At a speed override steps take longer, see "Speed override" in docs/design.md.
-        passed_s = observation.task.speed * (observation.stamp_wall_ns - stamp_ns) / 1e9
-        steps = passed_s / DT_S
-        done = min(max(steps, 1.0), float(HORIZON))
-        row = min(int(done), HORIZON - 1)
-        share = done - row if done < HORIZON else 1.0
-        asked = goals[row - 1] + share * (goals[row] - goals[row - 1])
-        if at_rest and steps > 1.0 and np.linalg.norm(np.ptp(goals[: row + 1, :3], axis=0)) < 1e-3:
-            return np.append(here[:3], asked[3])
-        return asked
+def follow(observation: Observation, last: Hand | None) -> Hand:
+    """The hand now, with the history of the one before."""
+    pose, gripper = observation.pose, observation.gripper
+    assert pose is not None
+    assert gripper is not None
+    hand = Hand(np.array(pose.position_m), yaw_of(pose), gripper.width_m)
+    if last is not None:
+        hand.swept_m = last.swept_m
+    if hand.position_m[2] < LOW_M:
+        down_m = None if last is None else last.down_m
+        hand.down_m = hand.position_m[:2] if down_m is None else down_m
+        way_m = float(np.linalg.norm(hand.position_m[:2] - hand.down_m))
+        hand.swept_m = max(hand.swept_m, way_m)
+    elif hand.position_m[2] > UP_M and hand.swept_m < PUSH_WAY_M:
+        hand.swept_m = 0.0
+    return hand
+
+
+def _goal(
+    observation: Observation, hand: Hand, before: tuple[int, FloatArray] | None
+) -> FloatArray:
+    """(4,) x, y, z, yaw requested when the observation was taken; `before`: `Memory.asked`."""
+    pose = observation.pose
+    assert pose is not None
+    here = hand.start
+    if pose.reference_position_m is not None:
+        here[:3] = pose.reference_position_m
+    # Parts that the command node cut off are not known here; an arm at rest shows them.
+    at_rest = bool(np.linalg.norm(pose.twist[:3]) < AT_REST_M_S)
+    if before is None:
+        return here
+    stamp_ns, goals = before
+    # At a speed override steps take longer, see "Speed override" in docs/design.md.
+    passed_s = observation.task.speed * (observation.stamp_wall_ns - stamp_ns) / 1e9
+    steps = passed_s / DT_S
+    done = min(max(steps, 1.0), float(HORIZON))
+    row = min(int(done), HORIZON - 1)
+    share = done - row if done < HORIZON else 1.0
+    asked = goals[row - 1] + share * (goals[row] - goals[row - 1])
+    if at_rest and steps > 1.0 and np.linalg.norm(np.ptp(goals[: row + 1, :3], axis=0)) < 1e-3:
+        return np.append(here[:3], asked[3])
+    return asked
 
 
 def yaw_of(pose: PoseState) -> float:

@@ -33,6 +33,11 @@ OF_BASE = frozenset({"pi0", "pi05", "smolvla"})
 whatever the data had; they resize images themselves."""
 RTC = frozenset({"pi0", "pi05", "smolvla"})
 """Policies that LeRobot conditions on the steps in execution."""
+NOISY = frozenset({"pi0", "pi05", "smolvla"})
+"""Policies that take the noise from which their flow begins."""
+BATCHED = NOISY | {"act"}
+"""Policies of LeRobot whose chunk depends on nothing but the observation and that noise, so that
+one pass answers several robots as one pass for each does."""
 REMOTE_CODE = frozenset({"gaussian_actor", "groot", "pi0_fast"})
 """LeRobot runs code from a model hub for these."""
 

@@ -17,6 +17,10 @@ the sizes in its config. Weights are read from safetensors; nothing is unpickled
 Of a robot of several arms they say what the numbers of each are. The arms' numbers follow one
 another in the state and in the actions, as in ALOHA's data.
 
+Several robots are answered by one pass of ACT, pi0, pi0.5 or SmolVLA, by one for each length of
+the steps in execution. Other policies, and those that are asked step by step, answer one robot
+after another: each has its own queues, all have the same weights.
+
     vla-zenoh worker lerobot --set checkpoint=DIR
     vla-zenoh worker lerobot --set checkpoint=DIR --set state=position+rpy+gripper_m \\
         --set action=delta --set rotation=rpy --set gripper=absolute_m --set dt_s=0.1
@@ -24,7 +28,9 @@ another in the state and in the actions, as in ALOHA's data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+import zlib
+from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 import numpy as np
@@ -33,7 +39,9 @@ from vla_zenoh_model_lerobot.dataset import dataset_options
 from vla_zenoh_model_lerobot.environment import EXTRAS, policy_folder, requirement
 from vla_zenoh_model_lerobot.mapping import (
     ACTION,
+    BATCHED,
     CONFIG,
+    NOISY,
     PIPELINES,
     STATE,
     WITHOUT_WORDS,
@@ -155,6 +163,11 @@ class LeRobot:
         self.policy: Any = None
         self._before: Any = None
         self._after: Any = None
+        self._batched = kind in BATCHED and not self._one_by_one
+        self._noise: dict[str, Any] = {}
+        """Robot -> the generator of its noise, so that nobody else's inferences change it."""
+        self._own: dict[str, Any] = {}
+        """Robot -> the policy with the queues of its episode."""
 
     def _check_action(self, config: Mapping[str, Any]) -> None:
         shape = features(self._folder, config, "output_features").get(ACTION)
@@ -258,9 +271,10 @@ class LeRobot:
         for file, wanted in zip(PIPELINES, (before, [action]), strict=True):
             check_statistics(self._folder / file, wanted)
 
-    def reset(self) -> None:
-        """Forget what was seen and planned in the last episode."""
-        for part in (self.policy, self._before, self._after):
+    def reset(self, robot: str = "") -> None:
+        """Forget what was seen and planned in the last episode of a robot; empty: of all."""
+        own = [policy for name, policy in self._own.items() if robot in ("", name)]
+        for part in (*own, self._before, self._after):
             if part is not None:
                 part.reset()
 
@@ -272,47 +286,138 @@ class LeRobot:
         Raises:
             SpecError: the policy's answer does not match its config.
         """
+        return self._pass([observation], committed)[0]
+
+    def infer_batch(
+        self,
+        observations: Sequence[Observation],
+        committed: Sequence[Committed | None] | None = None,
+    ) -> list[ActionSteps]:
+        """The next chunk of each robot, what `infer` answers to each.
+
+        Raises:
+            SpecError: the policy's answer does not match its config.
+        """
+        prefixes = committed or [None] * len(observations)
+        together: dict[Any, list[int]] = {}
+        for index, (seen, prefix) in enumerate(zip(observations, prefixes, strict=True)):
+            sizes = tuple(seen.images[camera].shape for camera in self._pictures)
+            # One guidance for all of a pass: LeRobot takes one delay and one number of steps.
+            steps = prefix and (prefix.frozen, len(prefix.steps))
+            alone = None if self._batched else index
+            together.setdefault((sizes, steps, alone), []).append(index)
+        answers: dict[int, ActionSteps] = {}
+        for indices in together.values():
+            of_pass = [observations[index] for index in indices]
+            found = self._pass(of_pass, *(prefixes[index] for index in indices))
+            answers.update(zip(indices, found, strict=True))
+        return [answers[index] for index in range(len(observations))]
+
+    def _pass(
+        self, observations: Sequence[Observation], *committed: Committed | None
+    ) -> list[ActionSteps]:
+        """One pass through the policy; `committed` have one length, or all are None."""
+        import torch
+
+        # LeRobot's guidance takes a gradient, which inference mode cannot.
+        with torch.no_grad() if self.takes_committed else torch.inference_mode():
+            batch = self._before(self._collate(observations, committed))
+            first = committed[0]
+            policy = self._policy_of(observations[0].robot)
+            if self._one_by_one:
+                wanted = policy.select_action(batch)[:, None]
+            else:
+                extra = self._noise_of(observations)
+                if first is not None:
+                    extra |= {
+                        "prev_chunk_left_over": batch.pop(ACTION),
+                        "inference_delay": first.frozen,
+                        "execution_horizon": len(first.steps),
+                    }
+                chunk = policy.predict_action_chunk(batch, **extra)
+                if chunk.ndim != 3 or len(chunk) != len(observations):
+                    raise SpecError(
+                        f"the policy's chunk has shape {tuple(chunk.shape)}, wanted "
+                        f"({len(observations)}, steps, numbers)"
+                    )
+                wanted = chunk[:, : self.spec.action.horizon]
+            # Step by step, as LeRobot does: some pipelines know no chunks.
+            steps = torch.stack([self._after(step) for step in wanted.unbind(1)], dim=1)
+        rows, raw = steps.double().cpu().numpy(), wanted.float().cpu().tolist()
+        return [
+            ActionSteps(self._steps(own), raw={"normalised": normalised})
+            for own, normalised in zip(rows, raw, strict=True)
+        ]
+
+    def _collate(
+        self, observations: Sequence[Observation], committed: Sequence[Committed | None]
+    ) -> dict[str, Any]:
+        """What LeRobot's pipeline takes, with the robots along the first axis."""
         import torch
         from lerobot.policies.utils import prepare_observation_for_inference
 
+        device = torch.device(self.policy.config.device)
+        each = [
+            prepare_observation_for_inference(self._given(seen, prefix), device, seen.prompt)
+            for seen, prefix in zip(observations, committed, strict=True)
+        ]
+        return {
+            name: torch.cat([one[name] for one in each])
+            if isinstance(value, torch.Tensor)
+            else [one[name] for one in each]
+            for name, value in each[0].items()
+        }
+
+    def _given(self, observation: Observation, committed: Committed | None) -> dict[str, Any]:
         given: dict[str, Any] = {
             # Copied: arrays from the bus are read-only, which torch does not accept.
             feature: np.array(observation.images[camera])
             for camera, (feature, _) in self._pictures.items()
         }
         if self._state:
-            each = [
+            parts = [
                 numbers.encode(observation.parts.get(part, observation))
                 for part, numbers in self._state.items()
             ]
-            given[STATE] = np.concatenate(each)
+            given[STATE] = np.concatenate(parts)
         if committed is not None:
             given[ACTION] = self._rows(committed.steps).astype(np.float32)
-        # LeRobot's guidance takes a gradient, which inference mode cannot.
-        with torch.no_grad() if self.takes_committed else torch.inference_mode():
-            device = torch.device(self.policy.config.device)
-            batch = self._before(
-                prepare_observation_for_inference(given, device, observation.prompt)
-            )
-            if self._one_by_one:
-                wanted = self.policy.select_action(batch)[:, None]
-            else:
-                prefix: dict[str, Any] = {}
-                if committed is not None:
-                    prefix = {
-                        "prev_chunk_left_over": batch.pop(ACTION),
-                        "inference_delay": committed.frozen,
-                        "execution_horizon": len(committed.steps),
-                    }
-                chunk = self.policy.predict_action_chunk(batch, **prefix)
-                if chunk.ndim != 3:
-                    raise SpecError(f"the policy's chunk has shape {tuple(chunk.shape)}")
-                wanted = chunk[:, : self.spec.action.horizon]
-            # Step by step, as LeRobot does: some pipelines know no chunks.
-            steps = torch.cat([self._after(step) for step in wanted.unbind(1)])
-        raw = {"normalised": wanted[0].float().cpu().tolist()}
-        rows = steps.double().cpu().numpy()
-        return ActionSteps(self._steps(rows), raw=raw)
+        return given
+
+    def _policy_of(self, robot: str) -> Any:
+        """The policy with a robot's own queues; weights are the same object for all."""
+        if self._batched:
+            return self.policy
+        if robot not in self._own:
+            own = self._own[robot] = self._another() if self._own else self.policy
+            own.reset()
+        return self._own[robot]
+
+    def _another(self) -> Any:
+        """The policy with the same modules, and with everything else of its own."""
+        import torch
+
+        own = copy.copy(self.policy)
+        for name in vars(own).keys() - vars(torch.nn.Module()).keys():
+            setattr(own, name, copy.deepcopy(getattr(own, name)))
+        return own
+
+    def _noise_of(self, observations: Sequence[Observation]) -> dict[str, Any]:
+        """Where a flow begins, from a generator for each robot; empty: the policy has none."""
+        if self._kind not in NOISY:
+            return {}
+        import torch
+
+        config = self.policy.config
+        shape = (1, config.chunk_size, config.max_action_dim)
+        drawn: list[torch.Tensor] = []
+        for seen in observations:
+            generator = self._noise.get(seen.robot)
+            if generator is None:
+                seed = torch.initial_seed() ^ zlib.crc32(seen.robot.encode())
+                generator = self._noise[seen.robot] = torch.Generator().manual_seed(seed)
+            drawn.append(torch.randn(shape, generator=generator))
+        return {"noise": torch.cat(drawn).to(config.device)}
 
     def _steps(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Action steps (H, D) of the policy's own numbers (H, C)."""

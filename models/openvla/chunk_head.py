@@ -49,8 +49,8 @@ class Head(nn.Module):
         self.fc2 = nn.Linear(read, AXES)
 
     def forward(self, places: Tensor) -> Tensor:
-        """(1, steps, 7) of (1, steps * 7, read)."""
-        rows = places.reshape(1, -1, places.shape[-1] * AXES)
+        """(n, steps, 7) of (n, steps * 7, read)."""
+        rows = places.reshape(len(places), -1, places.shape[-1] * AXES)
         features = torch.relu(self.fc1(self.layer_norm1(rows)))
         for block in self.mlp_resnet_blocks:
             features = block(features)
@@ -65,7 +65,7 @@ class StateProjector(nn.Module):
         self.fc1, self.fc2 = nn.Linear(size, read), nn.Linear(read, read)
 
     def forward(self, state: Tensor) -> Tensor:
-        """(1, read) of (1, size)."""
+        """(n, read) of (n, size)."""
         return self.fc2(nn.functional.gelu(self.fc1(state)))
 
 
@@ -84,20 +84,20 @@ class ChunkHead:
     steps: int
 
     @torch.inference_mode()
-    def act(
+    def act_all(
         self,
         network: Network,
-        ids: Sequence[int],
+        prompts: Sequence[Sequence[int]],
         pictures: Sequence[Sequence[Tensor]],
-        state: Sequence[float] | None,
+        states: Sequence[Sequence[float]] | None,
     ) -> Tensor:
-        """(steps, 7) numbers about [-1, 1].
+        """(n, steps, 7) numbers about [-1, 1].
 
         Args:
             network: its eyes, projector and Llama.
-            ids: T tokens of the prompt.
-            pictures: for each camera, the output of `Eyes.look`.
-            state: normalised, where the policy reads it.
+            prompts: tokens of each of n prompts.
+            pictures: for each camera, n images for each encoder, see `Eyes.forward`.
+            states: normalised, n of them, where the policy reads it.
 
         Raises:
             WorkerError: the network computes NaN.
@@ -106,20 +106,21 @@ class ChunkHead:
         # Before the projector, which treats every patch alike: one pass for all images.
         patches = network.projector(torch.cat(seen, dim=1))
         if self.state is not None:
-            row = torch.tensor([list(state or ())], device=network.device, dtype=network.dtype)
-            patches = torch.cat([patches, self.state(row)[:, None]], dim=1)
-        read = network.read([*ids, STOP_TOKEN], patches)
-        places = read.new_zeros(1, self.steps * AXES, read.shape[-1])
-        read = torch.cat([read[:, :-1], places, read[:, -1:]], dim=1)
-        count = read.shape[1]
-        # Every token attends to every other one: the mask adds zero.
-        mask = read.new_zeros(1, 1, count, count)
+            rows = torch.tensor(list(states or ()), device=network.device, dtype=network.dtype)
+            patches = torch.cat([patches, self.state(rows)[:, None]], dim=1)
+        read = network.read_all([[*ids, STOP_TOKEN] for ids in prompts], patches)
+        before = read.embeddings
+        places = before.new_zeros(len(before), self.steps * AXES, before.shape[-1])
+        # The prompts all end with the stop token, whatever their length.
+        before = torch.cat([before[:, :-1], places, before[:, -1:]], dim=1)
+        count = before.shape[1]
+        # Every token attends to every other one of its robot.
         out = network.language_model.model(
-            inputs_embeds=read, attention_mask=mask, use_cache=False
+            inputs_embeds=before, use_cache=False, **read.places(0, count, causal=False)
         ).last_hidden_state
         # The output for a position is one before it, as for next tokens.
         first = count - 1 - places.shape[1] - 1
-        numbers = self.head(out[:, first : first + places.shape[1]])[0].float()
+        numbers = self.head(out[:, first : first + places.shape[1]]).float()
         if not torch.isfinite(numbers).all():
             raise WorkerError("the network computes NaN or infinity; try --set dtype=float32")
         return numbers

@@ -27,6 +27,7 @@ the robot's state, and outputs a chunk. No code of the checkpoint runs.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -191,8 +192,8 @@ class OpenVLA:
                 raise WorkerError("the image encoders answer alike whatever the image is")
         # The first inference of a process costs much more than the others.
         ids, pictures = self.ids("stand still"), [self._pixels(noise)] * len(self._cameras)
-        state = [0.0] * len(self._state_range.low) if self._state_range else None
-        self._answer(ids, pictures, state)
+        states = [[0.0] * len(self._state_range.low)] if self._state_range else None
+        self._answers([ids], pictures, states)
 
     def ids(self, task: str) -> list[int]:
         """Tokens of the prompt for a task in a person's words.
@@ -224,31 +225,57 @@ class OpenVLA:
             SpecError: the model's answer is not an action.
             WorkerError: it computes NaN.
         """
-        seen = {
-            name: trained_form(observation.images[name], crop=self._crop) for name in self._cameras
-        }
-        ids = self.ids(observation.prompt)
-        raw: dict[str, Any] = {
-            "prompt": prompt_text(self._template, observation.prompt),
-            "prompt_tokens": ids,
-        }
-        state = None
-        if self._state_range is not None and self._state is not None:
-            measured = self._state.encode(observation)
-            state = raw["state"] = self._state_range.shrink(measured).tolist()
-        answer = self._answer(ids, [self._pixels(picture) for picture in seen.values()], state)
-        if self._head is None:
-            raw["action_tokens"] = answer
-            answer = [self.bins.decode(answer)]
-        normalised = np.asarray(answer, np.float64)
-        raw["normalised"] = normalised.tolist()
-        rows = self._range.expand(normalised)[: self.spec.action.horizon]
-        if self.spec.action.gripper == "open_fraction":
-            rows[:, -1] = np.clip(rows[:, -1], 0.0, 1.0)
-        return ActionSteps(self._meaning.steps(rows), raw=raw, pictures=seen)
+        return self.infer_batch([observation])[0]
 
-    def _answer(self, ids: list[int], pictures: list[Any], state: list[float] | None) -> Any:
-        """Tokens of a step; OFT: (steps, 7) numbers."""
+    def infer_batch(self, observations: Sequence[Observation]) -> list[ActionSteps]:
+        """What `infer` answers to each, by one pass for all.
+
+        Raises:
+            SpecError, WorkerError: as `infer`.
+        """
+        seen = [
+            {name: trained_form(one.images[name], crop=self._crop) for name in self._cameras}
+            for one in observations
+        ]
+        prompts = [self.ids(one.prompt) for one in observations]
+        states = None
+        if self._state_range is not None and self._state is not None:
+            measured = [self._state.encode(one) for one in observations]
+            states = [self._state_range.shrink(each).tolist() for each in measured]
+        pixels = [self._stacked([one[name] for one in seen]) for name in self._cameras]
+        answers = self._answers(prompts, pixels, states)
+        steps: list[ActionSteps] = []
+        for index, (one, ids, answer) in enumerate(
+            zip(observations, prompts, answers, strict=True)
+        ):
+            raw: dict[str, Any] = {
+                "prompt": prompt_text(self._template, one.prompt),
+                "prompt_tokens": ids,
+            }
+            if states is not None:
+                raw["state"] = states[index]
+            if self._head is None:
+                raw["action_tokens"] = answer
+                answer = [self.bins.decode(answer)]
+            normalised = np.asarray(answer, np.float64)
+            raw["normalised"] = normalised.tolist()
+            rows = self._range.expand(normalised)[: self.spec.action.horizon]
+            if self.spec.action.gripper == "open_fraction":
+                rows[:, -1] = np.clip(rows[:, -1], 0.0, 1.0)
+            steps.append(ActionSteps(self._meaning.steps(rows), raw=raw, pictures=seen[index]))
+        return steps
+
+    def _stacked(self, pictures: Sequence[Any]) -> list[Any]:
+        """One camera's images of all robots, for each encoder."""
+        import torch
+
+        looked = zip(*(self._pixels(picture) for picture in pictures), strict=True)
+        return [torch.cat(of_encoder) for of_encoder in looked]
+
+    def _answers(
+        self, prompts: list[list[int]], pixels: list[list[Any]], states: list[list[float]] | None
+    ) -> Any:
+        """Tokens of a step of each; OFT: (n, steps, 7) numbers."""
         if self._head is None:
-            return self.network.act(ids, pictures[0], AXES)
-        return self._head.act(self.network, ids, pictures, state).cpu().numpy()
+            return self.network.act_all(prompts, pixels[0], AXES)
+        return self._head.act_all(self.network, prompts, pixels, states).cpu().numpy()

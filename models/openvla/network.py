@@ -6,6 +6,7 @@ Names of parameters are those of the published checkpoints. Nothing of a checkpo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ class Eyes(nn.Module):
         ]
 
     def forward(self, pixels: Sequence[Tensor]) -> Tensor:
-        """(1, patches, width) from one normalised (1, 3, S, S) image for each encoder."""
+        """(n, patches, width) from n normalised (n, 3, S, S) images for each encoder."""
         seen = [
             # The last block is left out, as in training: its features are made for its own task.
             encoder.get_intermediate_layers(picture, n=[len(encoder.blocks) - 2])[0]
@@ -104,7 +105,7 @@ class Projector(nn.Module):
         self.fc3 = nn.Linear(read, read) if deep else None
 
     def forward(self, features: Tensor) -> Tensor:
-        """(1, patches, read) of (1, patches, seen)."""
+        """(n, patches, read) of (n, patches, seen)."""
         out = self.fc2(nn.functional.gelu(self.fc1(features)))
         return out if self.fc3 is None else self.fc3(nn.functional.gelu(out))
 
@@ -148,37 +149,95 @@ class Network(nn.Module):
         )
         return torch.cat([words[:, :1], patches.to(words.dtype), words[:, 1:]], dim=1)
 
-    def begin(self, embeddings: Tensor) -> tuple[Tensor, DynamicCache]:
-        """Read the whole prompt; the (1, vocabulary) logits of the next token and the cache."""
-        return self._step(DynamicCache(), inputs_embeds=embeddings)
+    def read_all(self, prompts: Sequence[Sequence[int]], patches: Tensor) -> Prompts:
+        """Several prompts, each with the patches (n, P, width) of its own images."""
+        each = [self.read(ids, own[None]) for ids, own in zip(prompts, patches, strict=True)]
+        return together(each)
 
-    def go_on(self, token: Tensor, cache: DynamicCache) -> tuple[Tensor, DynamicCache]:
-        """Read one more (1,) token; returns the same."""
-        return self._step(cache, input_ids=token[:, None])
+    def begin(self, embeddings: Tensor, **places: Tensor) -> tuple[Tensor, DynamicCache]:
+        """Read whole prompts; the (n, vocabulary) logits of the next tokens and the cache."""
+        return self._step(DynamicCache(), inputs_embeds=embeddings, **places)
+
+    def go_on(
+        self, token: Tensor, cache: DynamicCache, **places: Tensor
+    ) -> tuple[Tensor, DynamicCache]:
+        """Read one more token of each, (n,); returns the same."""
+        return self._step(cache, input_ids=token[:, None], **places)
 
     def _step(self, cache: DynamicCache, **given: Tensor) -> tuple[Tensor, DynamicCache]:
         out = self.language_model(**given, past_key_values=cache, use_cache=True, logits_to_keep=1)
         return out.logits[:, -1], cache
 
-    @torch.inference_mode()
     def act(self, ids: Sequence[int], pixels: Sequence[Tensor], count: int) -> list[int]:
-        """The `count` most likely tokens, each after the ones before it.
+        """What `act_all` answers to one prompt and its image."""
+        return self.act_all([ids], pixels, count)[0]
+
+    @torch.inference_mode()
+    def act_all(
+        self, prompts: Sequence[Sequence[int]], pixels: Sequence[Tensor], count: int
+    ) -> list[list[int]]:
+        """The `count` most likely tokens after each prompt, each after the ones before it.
 
         No end-of-text ends it early: an action always has all its numbers.
+
+        Args:
+            prompts: n of them.
+            pixels: n images for each encoder, see `Eyes.forward`.
+            count: of tokens.
 
         Raises:
             WorkerError: a logit is not a number.
         """
-        logits, cache = self.begin(self.read(ids, self.projector(self.vision_backbone(pixels))))
+        read = self.read_all(prompts, self.projector(self.vision_backbone(pixels)))
+        length = read.embeddings.shape[1]
+        logits, cache = self.begin(read.embeddings, **read.places(0, length, causal=True))
         tokens = [best(logits)]
-        for _ in range(count - 1):
-            logits, cache = self.go_on(tokens[-1], cache)
+        for place in range(length, length + count - 1):
+            where = read.places(place, place + 1, causal=True)
+            logits, cache = self.go_on(tokens[-1], cache, **where)
             tokens.append(best(logits))
-        return [int(token) for token in torch.cat(tokens).tolist()]
+        return torch.stack(tokens, dim=1).tolist()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prompts:
+    """Prompts of several robots, the shorter ones padded in front, so that all end together.
+
+    Args:
+        embeddings: (n, T, width).
+        padding: (n,) places in front of each that are none of its own.
+    """
+
+    embeddings: Tensor
+    padding: Tensor
+
+    def places(self, begin: int, end: int, *, causal: bool) -> dict[str, Tensor]:
+        """Llama's arguments for the places from `begin` to `end`: their numbers in each prompt,
+        and what each sees: the own places up to itself, or all. Empty: as it does by itself."""
+        if causal and not self.padding.any():
+            return {}
+        device, pad = self.padding.device, self.padding[:, None]
+        at, seen = torch.arange(begin, end, device=device), torch.arange(end, device=device)
+        # Padding sees itself: of nothing at all there is no mean.
+        own = (seen >= pad)[:, None, :] | (seen == at[:, None])[None]
+        if causal:
+            own = own & (seen <= at[:, None])[None]
+        mask = torch.zeros(own.shape, device=device, dtype=self.embeddings.dtype)
+        mask = mask.masked_fill(~own, torch.finfo(mask.dtype).min)
+        numbers = (at[None] - pad).clamp(min=0)
+        return {"attention_mask": mask[:, None], "position_ids": numbers}
+
+
+def together(each: Sequence[Tensor]) -> Prompts:
+    """Prompts (1, T, width) of any length as one."""
+    longest = max(one.shape[1] for one in each)
+    padding = [longest - one.shape[1] for one in each]
+    rows = [nn.functional.pad(one, (0, 0, pad, 0)) for one, pad in zip(each, padding, strict=True)]
+    return Prompts(torch.cat(rows), torch.tensor(padding, device=each[0].device))
 
 
 def best(logits: Tensor) -> Tensor:
-    """(1,) the most likely token.
+    """(n,) the most likely token of each.
 
     Raises:
         WorkerError: a logit is not a number, so none is the most likely one.

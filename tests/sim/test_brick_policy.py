@@ -314,7 +314,7 @@ def test_worker_and_teacher_remember_the_same_of_a_hand(
         policy.infer(replace(observation, pose=pose))
         taught = Hand(*place.tolist(), 0.0, 0.08, swept_m, down).swept()
         swept_m, down = taught.swept_m, taught.down
-        remembered = policy._hand  # pyright: ignore[reportAttributeAccessIssue]
+        remembered = policy._memory[""].hand  # pyright: ignore[reportAttributeAccessIssue]
         assert remembered.swept_m == pytest.approx(swept_m)
         assert (remembered.down_m is None) == (down is None)
         greatest_m = max(greatest_m, swept_m)
@@ -330,7 +330,8 @@ def test_a_push_that_was_made_is_forgotten_with_another_prompt(policy: Policy) -
         for place in low:
             policy.infer(replace(observation, pose=replace(observation.pose, position_m=place)))
             low = [low[-1]]
-        assert policy._hand.swept_m == pytest.approx(swept_m)  # pyright: ignore
+        remembered = policy._memory[""].hand  # pyright: ignore
+        assert remembered.swept_m == pytest.approx(swept_m)
 
 
 # -- the steps in execution ----------------------------------------------------------------------
@@ -363,7 +364,11 @@ def test_a_chunk_that_goes_on_from_given_steps_is_nearer_to_the_teacher_than_one
         blue = replace(observation.task, prompt="put the blue brick in the box")
         other = made.infer(replace(observation, task=blue)).steps
         made.reset()
-        monkeypatch.setattr(made, "think", lambda o, h, g, told=told: think(o, h, g * told))
+        monkeypatch.setattr(
+            made,
+            "think",
+            lambda asked, told=told: think([q._replace(given=q.given * told) for q in asked]),
+        )
         steps = made.infer(observation, committed=Committed(other[:-1], FROZEN)).steps
         np.testing.assert_array_equal(steps[:FROZEN], other[:FROZEN])
         hand = Hand(*position_m.tolist(), 0.0, gripper.width_m)

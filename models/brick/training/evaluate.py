@@ -18,6 +18,7 @@ import argparse
 import json
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from states import Situation
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 from vla_zenoh_benchmarks.lockstep.worker import Delays
 from vla_zenoh_benchmarks.statistics import wilson_95
-from worker import HORIZON, Brick, Hand, Waypoints
+from worker import HORIZON, Brick, Hand, Question, Waypoints
 
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
 from vla_zenoh.lab.tasks.judge import LIMIT_S, TaskJudge, Verdict
@@ -118,12 +119,13 @@ class Teacher(Brick):
     def load(self) -> None:
         """Nothing to load."""
 
-    def think(self, observation: Observation, hand: Hand, given: np.ndarray) -> Waypoints:
+    def think(self, questions: Sequence[Question]) -> list[Waypoints]:
         """Waypoints by the teacher."""
         if self._order.family == "stay":
-            return Waypoints(np.zeros((HORIZON, 4)), np.zeros(HORIZON, bool), False, "")
-        way = taught(self._world, self._order, hand, given)
-        return Waypoints(way[:, :4], way[:, 4] > 0.5, True, "")
+            stay = Waypoints(np.zeros((HORIZON, 4)), np.zeros(HORIZON, bool), False, "")
+            return [stay for _ in questions]
+        ways = [taught(self._world, self._order, one.hand, one.given) for one in questions]
+        return [Waypoints(way[:, :4], way[:, 4] > 0.5, True, "") for way in ways]
 
 
 class Watched(Brick):
@@ -138,12 +140,13 @@ class Watched(Brick):
         self.seen: list[tuple[Observation, Hand]] = []
         self.samples: list[dict[str, np.ndarray]] = []
 
-    def think(self, observation: Observation, hand: Hand, given: np.ndarray) -> Waypoints:
+    def think(self, questions: Sequence[Question]) -> list[Waypoints]:
         """Waypoints by the network."""
-        self.seen.append((observation, hand))
-        if self._collect and self._order.family != "stay":
-            self._note(observation, hand)
-        return super().think(observation, hand, given)
+        for observation, hand, _ in questions:
+            self.seen.append((observation, hand))
+            if self._collect and self._order.family != "stay":
+                self._note(observation, hand)
+        return super().think(questions)
 
     def _note(self, observation: Observation, hand: Hand) -> None:
         world = self._stage.world

@@ -18,6 +18,7 @@ from model import (  # noqa: E402
     WRIST,
     Brick,
     Hand,
+    Question,
     Waypoints,
     tokens_of,
 )
@@ -33,6 +34,7 @@ __all__ = [
     "WRIST",
     "Brick",
     "Hand",
+    "Question",
     "Waypoints",
     "tokens_of",
 ]
