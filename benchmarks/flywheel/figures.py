@@ -39,7 +39,7 @@ def training(row: Mapping[str, Any]) -> Drawn:
     figure, (axis,) = panels(1, COLUMN_IN, HEIGHT_IN)
     epochs, loss = zip(*row["l1_by_epoch"], strict=True)
     axis.plot(epochs, loss, color=look(0, 1).colour)
-    axis.set_yscale("log")
+    axis.set_ylim(0.0, 1.05 * max(loss))
     axis.set_xlabel("epoch")
     axis.set_ylabel("mean L1, normalized")
     return Drawn(figure, f"Training of ACT: {row['steps']} steps, {epochs[-1]:.1f} epochs.")

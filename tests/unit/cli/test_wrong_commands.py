@@ -38,7 +38,7 @@ WRONG: list[tuple[str, int, str]] = [
     (
         "demo --profile nosuch",
         FAILED,
-        "error: no profile called 'nosuch'. Known: fr3, panda_bricks, pan",
+        "error: no profile called 'nosuch'. Known: fr3, fr3_franka_node, panda_bricks, pan",
     ),
     (
         "demo --profile panda_sin",
@@ -48,7 +48,7 @@ WRONG: list[tuple[str, int, str]] = [
     (
         "up nosuch",
         FAILED,
-        "error: no profile called 'nosuch'. Known: fr3, panda_bricks, panda_fci, panda_ros2, pan",
+        "error: no profile called 'nosuch'. Known: fr3, fr3_franka_node, panda_bricks, pan",
     ),
     ("up ./absent.yaml", FAILED, "error: there is no file or folder './absent.yaml'"),
     ("up --listen x", USAGE, "'x' is not an endpoint: write tcp/HOST:PORT"),

@@ -13,7 +13,7 @@ from collections import Counter
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.errors import CountedError, SpecError, VlaZenohError, in_words
 from vla_zenoh_r2c import link, wire
 from vla_zenoh_r2c.admission import Admission
@@ -78,7 +78,7 @@ class Gateway:
             if time.monotonic() < self._quiet_until_s:
                 self._tell("quiet", "an observation is left to the other policy")
                 return
-            self._answer(received.sample.payload.to_bytes())
+            self._answer(bytes_of(received.sample.payload, wire.MAX_BYTES))
         except VlaZenohError as error:
             counted = isinstance(error, (CountedError, SpecError))
             self._tell(error.reason if counted else "refused", str(error))

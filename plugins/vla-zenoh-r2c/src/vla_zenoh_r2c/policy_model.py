@@ -113,11 +113,13 @@ class R2cPolicy:
 
     def _take(self) -> FloatArray | None:
         """(H, n) numbers of the answer to the newest question, if it has come."""
+        from vla_zenoh.bus.buffers import bytes_of
+
         for each in self._answers.pop_rejected():
             self._question.ignore(each.why, each.times)
         found: FloatArray | None = None
         for each in self._answers.drain():
-            steps = self._question.take(each.sample.payload.to_bytes())
+            steps = self._question.take(bytes_of(each.sample.payload, wire.MAX_ACTION_BYTES))
             found = found if steps is None else steps
         return found
 
