@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import nan
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh_figures.style import ASKED, COLUMN_IN, Drawn, look, panels, styled, write
+from vla_zenoh_figures.style import COLUMN_IN, Drawn, look, panels, styled, write
 
-HEIGHT_IN, KINDS = 1.9, ("svg", "pdf")
+HEIGHT_IN, KINDS = 1.5, ("svg", "pdf")
 APART_MS = 7.0
 """Between lines at one delay, so that no interval hides another."""
 WORDS = {
@@ -47,8 +48,8 @@ def training(row: Mapping[str, Any]) -> Drawn:
 
 @styled
 def success_over_delay(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Drawn:
-    """Success of one policy over the delay of its chunks, by what the arm does meanwhile."""
-    figure, (axis,) = panels(1, COLUMN_IN, HEIGHT_IN)
+    """Success of one policy and its steps over the delay of its chunks, by what the arm does."""
+    figure, (success, steps) = panels(2, COLUMN_IN, HEIGHT_IN)
     ways = [way for way in WORDS if any(name.startswith(way) for name in names)]
     for index, way in enumerate(ways):
         own = [row for row, name in zip(rows, names, strict=True) if name.startswith(way)]
@@ -56,19 +57,22 @@ def success_over_delay(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) 
         at_ms = [row["delay_ms"] + apart for row in own]
         for place, row in zip(at_ms, own, strict=True):
             interval = [100 * share for share in row["wilson_95"]]
-            axis.plot([place, place], interval, color=mine.colour, linewidth=1.2)
-        share = [100 * row["success_rate"] for row in own]
+            success.plot([place, place], interval, color=mine.colour, linewidth=1.2)
         drawn = {"color": mine.colour, "linestyle": mine.dash, "marker": mine.marker}
-        axis.plot(at_ms, share, label=WORDS[way], markersize=4.0, **drawn)
-    axis.axhline(0.0, color=ASKED, linewidth=0.5)
-    axis.set_xticks(sorted({row["delay_ms"] for row in rows}))
-    axis.set_ylim(-3, 103)
-    axis.set_xlabel("inference (ms)")
-    axis.set_ylabel("success rate (%)")
+        share = [100 * row["success_rate"] for row in own]
+        success.plot(at_ms, share, label=WORDS[way], markersize=4.0, **drawn)
+        taken = [row["steps_to_success_p50"] or nan for row in own]
+        steps.plot(at_ms, taken, markersize=4.0, **drawn)
+    success.set_ylim(0.0, 103.0)
+    success.set_ylabel("success rate (%)")
+    steps.set_ylim(bottom=0.0)
+    steps.set_ylabel("steps to success")
+    steps.set_xticks(sorted({row["delay_ms"] for row in rows}))
+    steps.set_xlabel("inference (ms)")
     figure.legend(loc="outside upper center", ncols=1)
     seeds = [each["seed"] for each in rows[0]["all"]]
     caption = (
         f"Success with its interval at 95 % (Wilson), n = {len(seeds)} episodes a point, seeds "
-        f"{seeds[0]} to {seeds[-1]}."
+        f"{seeds[0]} to {seeds[-1]}; median steps of the episodes that succeeded."
     )
     return Drawn(figure, caption)

@@ -48,6 +48,7 @@ def test_figures_are_drawn_of_what_was_done(tmp_path: Path) -> None:
             f"{way}-{delay_ms}ms": {
                 "delay_ms": float(delay_ms),
                 "success_rate": 0.5,
+                "steps_to_success_p50": 90.0 if delay_ms else None,
                 "wilson_95": [0.1, 0.9],
                 "all": [cell(1000), cell(1001)],
             }
