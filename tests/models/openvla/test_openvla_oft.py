@@ -177,7 +177,8 @@ def test_a_chunk_is_what_the_computation_by_hand_gives(whole: Path, oft: Oft, se
     steps = check_steps(policy.spec.action, answer.steps)
     low, high = np.array(BRIDGE["q01"])[:6], np.array(BRIDGE["q99"])[:6]
     units = np.clip(low + (wanted[:, :6] + 1) / 2 * (high - low), -1, 1)
-    np.testing.assert_allclose(steps[:, :6], units * ([0.05] * 3 + [0.5] * 3), atol=ATOL)
+    scale = [policy.spec.action.position_scale_m] * 3 + [1.0] * 3
+    np.testing.assert_allclose(steps[:, :6] * scale, units * ([0.05] * 3 + [0.5] * 3), atol=ATOL)
     assert steps.shape == (STEPS, 7)
     assert (np.abs(raw["state"]) <= 1).all()
 
