@@ -11,12 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import r2c_peer as peer
 from peer_rig import free_port
-from r2c_rig import Gateway, Robot, Router, write
+from r2c_rig import DEVICE, Gateway, Robot, Router, write
 
 from vla_zenoh.profile import load_profile
 
 JOINTS = load_profile("so101_sim").robot.arm_joints
+HOME = load_profile("so101_sim").robot.home_rad
 STEP_RAD = 0.01
 ROBOT = """\
 project: project-demo
@@ -135,3 +137,36 @@ def test_our_gateway_killed_leaves_its_robot_standing_and_a_new_one_goes_on(benc
     print(f"stood {stood_s:.2f} s after kill -9 of the gateway; moved {moved_s:.2f} s after a new")
     steps_rad = np.diff(bench.robot.targets_rad)
     assert np.abs(steps_rad).max() < STEP_RAD / 3 + DROPPED_RAD
+
+
+def test_its_robot_killed_and_started_again_begins_an_episode(bench: Bench) -> None:
+    bench.robot.moves_on()
+    bench.robot.kill()
+    bench.robot = bench.new_robot()
+    bench.robot.moves_on()
+    assert bench.gateway.text.count("the robot begins at observation") == 2
+    assert bench.robot.targets_rad[0] == pytest.approx(STEP_RAD / 3, abs=EXACT_RAD)
+
+
+def test_a_router_killed_and_started_again_joins_both(bench: Bench) -> None:
+    bench.robot.moves_on()
+    bench.router.kill()
+    stood_s = bench.robot.stands_after()
+    assert stood_s < CHUNK_S + 0.5
+    bench.router = bench.new_router()
+    moved_s = bench.robot.moves_on()
+    print(f"stood {stood_s:.2f} s after kill -9 of the router; moved {moved_s:.2f} s after a new")
+
+
+def test_beside_a_second_policy_ours_stays_out(bench: Bench) -> None:
+    bench.robot.moves_on()
+    other = peer.Policy(
+        bench.port, lambda seen: peer.actions([seen["position"]], id=seen["id"]), DEVICE
+    )
+    began_s = time.monotonic()
+    bench.gateway.until("second_policy (")
+    print(f"a second policy was told after {time.monotonic() - began_s:.2f} s")
+    bench.gateway.until("quiet (")
+    other.session.close()
+    bench.gateway.interrupt()
+    assert "quiet" in bench.gateway.text

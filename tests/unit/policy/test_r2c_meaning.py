@@ -189,6 +189,15 @@ def seen(id: int, stamp_ms: int) -> wire.Seen:
     return wire.decode_observation(peer.observation(HOME, id=id, timestamp=stamp_ms))
 
 
+def test_a_robot_that_restarts_at_once_begins_with_its_second_observation() -> None:
+    admission = Admission(max_age_s=1.0)
+    assert admission.admit(seen(5, 9_900), 9_950, 10.0)
+    with pytest.raises(CodecError, match="another robot"):
+        admission.admit(seen(1, 10_000), 10_050, 10.1)
+    assert admission.admit(seen(6, 11_000), 11_050, 11.1)
+    assert not admission.admit(seen(7, 12_000), 12_050, 12.1)
+
+
 @pytest.mark.parametrize(
     ("id", "stamp_ms", "now_s", "reason"),
     [

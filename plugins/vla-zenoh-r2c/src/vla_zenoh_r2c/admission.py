@@ -25,6 +25,7 @@ class Admission:
     _id: int = 0
     _stamp_ms: int = 0
     _at_s: float = float("-inf")
+    _doubted: bool = False
 
     def admit(self, seen: Seen, wall_ms: float, now_s: float) -> bool:
         """Admit an observation; whether it begins an episode: the robot has started (again).
@@ -52,10 +53,12 @@ class Admission:
             raise CodecError("replayed", f"observation {seen.id} is not newer than {self._id}")
         begins = seen.id <= self._id or self._id == 0
         if begins and now_s - self._at_s < RESTARTS_S:
+            self._doubted = True  # it may be the robot itself, which has restarted at once
             raise CodecError(
                 "foreign",
                 f"observation {seen.id} came {now_s - self._at_s:.2f} s after {self._id}: another "
                 "robot publishes as this device",
             )
+        begins, self._doubted = begins or self._doubted, False
         self._id, self._stamp_ms, self._at_s = seen.id, seen.stamp_ms, now_s
         return begins
