@@ -71,7 +71,7 @@ def mean_action(dataset: Path) -> list[float]:
 
 
 def led_frames(dataset: Path) -> int:
-    """Frames of a data set that another worker led than the policy."""
+    """Frames of a data set in which the policy had been taken over."""
     files = sorted((dataset / "data").rglob("*.parquet"))
     return sum(sum(pq.read_table(file)["intervention"].to_pylist()) for file in files)
 

@@ -5,20 +5,19 @@ from __future__ import annotations
 import json
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from driver_report import Report
+from driver_rig import DriverRig
 from franka_node_peer import ENDPOINT, FrankaNode
 from franka_node_rig import SCRIPT, Client, python
 from vla_zenoh_franka_node import wire
 
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.python_driver import PythonDriver
 
 SOON_S = 20.0
 PROFILE = f"""
@@ -30,29 +29,13 @@ franka_node: {{endpoint: "{ENDPOINT}"}}
 pytestmark = pytest.mark.timeout(120)
 
 
-class Rig:
+class Rig(DriverRig):
     """Our driver at the node."""
 
+    soon_s = SOON_S
+
     def __init__(self, folder: Path) -> None:
-        path = folder / "lab.yaml"
-        path.write_text(PROFILE)
-        self.driver = PythonDriver(load_profile(str(path)))
-        self.report = Report(self.driver)
-        self.newest: Any = None
-
-    def until(self, what: Callable[[], bool]) -> None:
-        end_s = time.monotonic() + SOON_S
-        while not what():
-            assert time.monotonic() < end_s, (self.driver.fault, self.driver.status())
-            self.tick()
-
-    def tick(self) -> None:
-        measured = self.driver.read(time.monotonic_ns())
-        self.newest = self.newest if measured is None else measured
-        time.sleep(0.004)
-
-    def ready(self) -> None:
-        self.until(lambda: self.newest is not None and self.driver.away == "")
+        super().__init__(folder, PROFILE)
 
     def ask(self, client: Client, verb: str) -> dict[str, Any]:
         """What their client says to a verb, while ours goes on."""

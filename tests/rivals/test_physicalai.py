@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from driver_report import Report
+from driver_rig import DriverRig
 from physicalai_rig import Client, Owner
 
 from vla_zenoh.errors import NodeError, PeerError
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types import GripperState, JointReference, JointState
 
 SOON_S, LOST_S = 10.0, 3.0
@@ -29,23 +28,13 @@ PROFILE = "extends: so101_physicalai\nphysicalai: {name: rival, units: normalise
 pytestmark = pytest.mark.timeout(120)
 
 
-class Rig:
+class Rig(DriverRig):
     """Our driver of the robot ``rival``."""
 
-    def __init__(self, folder: Path) -> None:
-        path = folder / "lab.yaml"
-        path.write_text(PROFILE)
-        self.driver = PythonDriver(load_profile(str(path)))
-        self.report = Report(self.driver)
-        self.newest: Any = None
+    soon_s = SOON_S
 
-    def until(self, what: Callable[[], bool]) -> None:
-        end_s = time.monotonic() + SOON_S
-        while not what():
-            assert time.monotonic() < end_s, (self.driver.fault, self.driver.status())
-            measured = self.driver.read(time.monotonic_ns())
-            self.newest = self.newest if measured is None else measured
-            time.sleep(0.004)
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, PROFILE)
 
     def position_rad(self) -> np.ndarray:
         self.newest = None

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import franka_node_peer as peer
 import numpy as np
 import pytest
-from driver_report import Report
+from driver_rig import DriverRig
 from franka_node_peer import FrankaNode
 from vla_zenoh_franka_node import wire
 
 from vla_zenoh.errors import CodecError, NodeError, ProfileError
 from vla_zenoh.kinematics.so3 import exp3, rotation_from_quat
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types import GripperCommand
 from vla_zenoh.types.records import JointReference, PoseReference
 
@@ -40,30 +38,14 @@ franka_node: {{endpoint: "{endpoint}"{options}}}
 pytestmark = pytest.mark.realtime
 
 
-class Rig:
+class Rig(DriverRig):
     """A driver, and what it reported."""
 
+    soon_s = SOON_S
+
     def __init__(self, folder: Path, command: str = "joint", options: str = "") -> None:
-        path = folder / "lab.yaml"
-        path.write_text(PROFILE.format(command=command, endpoint=peer.ENDPOINT, options=options))
-        self.profile = load_profile(str(path))
-        self.driver = PythonDriver(self.profile)
-        self.report = Report(self.driver)
-        self.newest: Any = None
-
-    def until(self, what: Callable[[], bool], within_s: float = SOON_S) -> None:
-        end_s = time.monotonic() + within_s
-        while not what():
-            assert time.monotonic() < end_s, (self.driver.fault, self.driver.status())
-            self.tick()
-
-    def tick(self) -> None:
-        measured = self.driver.read(time.monotonic_ns())
-        self.newest = self.newest if measured is None else measured
-        time.sleep(0.004)
-
-    def ready(self) -> None:
-        self.until(lambda: self.newest is not None and self.driver.away == "")
+        given = {"command": command, "endpoint": peer.ENDPOINT, "options": options}
+        super().__init__(folder, PROFILE.format(**given))
 
     def move_joints(self, position_rad: Any) -> None:
         self.driver.move(JointReference(np.array(position_rad), STILL, STILL), 0)

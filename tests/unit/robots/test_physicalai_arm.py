@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from driver_report import Report
+from driver_rig import DriverRig
 from physicalai_peer import PORT_OF_FOLLOWER, SO101, Client, Owner, packed, unpacked
 from vla_zenoh_physicalai import wire
 
 from vla_zenoh.errors import CodecError, NodeError, ProfileError
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types import GripperCommand, JointReference
 
 SOON_S = 4.0
@@ -29,33 +26,18 @@ EXACT_RAD = 1e-6
 pytestmark = pytest.mark.realtime
 
 
-class Rig:
+class Rig(DriverRig):
     """A driver, and what it reported."""
 
-    def __init__(self, folder: Path, options: str = "name: follower") -> None:
-        path = folder / "lab.yaml"
-        path.write_text(PROFILE.format(options=options))
-        self.profile = load_profile(str(path))
-        self.driver = PythonDriver(self.profile)
-        self.report = Report(self.driver)
+    soon_s = SOON_S
 
-    def until(self, what: Callable[[], bool]) -> None:
-        end_s = time.monotonic() + SOON_S
-        while not what():
-            assert time.monotonic() < end_s, (self.driver.fault, self.status)
-            self.driver.read(time.monotonic_ns())
-            time.sleep(0.004)
+    def __init__(self, folder: Path, options: str = "name: follower") -> None:
+        super().__init__(folder, PROFILE.format(options=options))
 
     def measured(self) -> Any:
-        found: list[Any] = []
-        self.until(lambda: bool(found) or bool(self._read(found)))
-        return found[0]
-
-    def _read(self, found: list[Any]) -> list[Any]:
-        measurement = self.driver.read(time.monotonic_ns())
-        if measurement is not None:
-            found.append(measurement)
-        return found
+        self.newest = None
+        self.until(lambda: self.newest is not None)
+        return self.newest
 
     @property
     def status(self) -> Any:
