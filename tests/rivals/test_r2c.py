@@ -20,22 +20,7 @@ from vla_zenoh.profile import load_profile
 JOINTS = load_profile("so101_sim").robot.arm_joints
 HOME = load_profile("so101_sim").robot.home_rad
 STEP_RAD = 0.01
-ROBOT = """\
-project: project-demo
-device: so101
-order: [joint_1, joint_2, joint_3, joint_4, joint_5, joint_6]
-joints:
-  joint_1: shoulder_pan
-  joint_2: shoulder_lift
-  joint_3: elbow_flex
-  joint_4: wrist_flex
-  joint_5: wrist_roll
-unit: radians
-gripper: {name: joint_6, shut: 0.0, open: 1.0}
-cameras:
-  front: {name: front, colours: rgb}
-step_hz: 30
-"""
+ROBOT = peer.DECLARED.replace("project: lab", "project: project-demo")
 """Its robot_dummy_config.yaml, in our words."""
 SWEEP = """\
 import numpy as np

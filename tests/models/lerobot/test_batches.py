@@ -14,7 +14,7 @@ import tiny_act
 import tiny_smolvla
 from batch_law import ROBOTS, Round, check_law, rounds
 from hypothesis import HealthCheck, given, settings
-from test_lerobot import loaded, looking
+from test_lerobot import ACTION_OPTIONS, loaded, looking
 
 from vla_zenoh.policy import Observation
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -72,15 +72,7 @@ def smolvla(
         "checkpoint": str(folder),
         "device": "cpu",
         "rtc": request.param,
-        "state": "position+rotvec+gripper_m",
-        "action": "delta",
-        "anchor": "goal",
-        "relative_to": "previous",
-        "controller": "none",
-        "rotation": "rpy",
-        "gripper": "open_fraction",
-        "gripper_open": "high",
-        "dt_s": "0.1",
+        **ACTION_OPTIONS,
     }
 
     def make() -> Any:
