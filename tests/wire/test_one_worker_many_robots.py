@@ -45,6 +45,8 @@ SLOW_S = 0.12
 """One inference of a slow model: longer than a request's period, so that requests meet."""
 SLOWER_S, BEHIND_S, OLDEST_S = 0.3, 0.45, 0.6
 """An inference, and the age of what a robot sends, which together are more than is obeyed."""
+IN_A_BATCH_S, OLDEST_OF_A_BATCH_S = 0.25, 0.6
+"""What each robot adds to an inference, so that one for three robots is too late for all."""
 LEAST_SHARE = 0.3
 """Of its rate that a robot must be given on a busy computer; a held-up one gets nothing."""
 START_S = 40.0
@@ -103,9 +105,10 @@ class Together:
 
     Args:
         slow_s: one inference, of one robot or of all.
+        each_s: what every robot adds to it.
     """
 
-    def __init__(self, slow_s: float = 0.0) -> None:
+    def __init__(self, slow_s: float = 0.0, each_s: float = 0.0) -> None:
         self.spec = ModelSpec(
             name="together",
             observation=ObservationSpec(cameras=(), state=("pose", "gripper"), prompt=True),
@@ -113,7 +116,7 @@ class Together:
         )
         self.batches: list[tuple[str, ...]] = []
         self.resets: list[str] = []
-        self._slow_s = slow_s
+        self._slow_s, self._each_s = slow_s, each_s
 
     def reset(self, robot: str) -> None:
         self.resets.append(robot)
@@ -122,7 +125,7 @@ class Together:
         return self.infer_batch([observation])[0]
 
     def infer_batch(self, observations: Sequence[Observation]) -> list[ActionSteps]:
-        time.sleep(self._slow_s)
+        time.sleep(self._slow_s + self._each_s * len(observations))
         self.batches.append(tuple(seen.robot for seen in observations))
         return [self._one(seen) for seen in observations]
 
@@ -260,6 +263,27 @@ def test_a_chunk_that_would_come_too_late_is_computed_when_it_keeps_no_other_rob
             looker = Client(override(profile, {"robot": {"name": "a"}}), session).subscribe()
             status = until("its status", lambda: looker.status("worker-together"))
             assert status.detail["complaint"].startswith("too_late")
+
+
+def test_where_a_batch_of_all_is_too_late_for_all_they_are_answered_in_smaller_ones(
+    profile: Profile, router: None
+) -> None:
+    model = Together(each_s=IN_A_BATCH_S)
+    oldest = override(profile, {"timing": {"max_observation_age_s": OLDEST_OF_A_BATCH_S}})
+    with served(oldest, model) as robots:
+        for robot in robots.values():
+            robot.asked(prompt="1", rate_hz=50.0)
+        until("a batch of all", lambda: set(ROBOTS) in map(set, model.batches))
+        had = {name: len(robot.chunks) for name, robot in robots.items()}
+
+        def in_time(name: str) -> bool:
+            return any(
+                chunk.inference_end_ns - chunk.observation_stamp_ns < OLDEST_OF_A_BATCH_S * 1e9
+                for chunk in robots[name].chunks[had[name] + 1 :]
+            )
+
+        until("chunks in time for every robot", lambda: all(map(in_time, ROBOTS)))
+        assert len(model.batches[-1]) < len(ROBOTS)
 
 
 def test_each_robot_has_its_own_rate(profile: Profile, router: None) -> None:

@@ -33,6 +33,9 @@ NAP_S, NAPS = 0.004, 5
 BLIND_NAP_S, IDLE_NAP_S = 0.002, 0.02
 SEEN_QUALITY = 95
 """Of the JPEG images a model was given."""
+SHARE_OF_AGE = 0.8
+"""Of the age at which a chunk is rejected, the part that an inference for several robots may take;
+the rest is for images, the network and robots that are a little behind."""
 
 Ready = tuple[RobotSession, Observation, int]
 """A robot, its observation, and when that was complete (wall ns)."""
@@ -42,7 +45,8 @@ class WorkerNode:
     """Runs one model for one robot or several of a kind, each with a `RobotSession`.
 
     A model with ``infer_batch`` infers for all robots that are ready at once; it does not wait for
-    the others. A robot whose chunk would come too late to be obeyed waits for an idle moment.
+    the others. A robot whose chunk would come too late to be obeyed waits for an idle moment, and
+    where an inference for all would make every chunk too late, it is for fewer at a time.
 
     Args:
         profile, session: of the robots; the caller closes the session.
@@ -77,8 +81,11 @@ class WorkerNode:
         self._infer_batch: Callable[..., Any] | None = getattr(policy, "infer_batch", None)
         max_batch = getattr(policy, "max_batch", None) or max(len(robots), 1)
         self._max_batch: int = 1 if self._infer_batch is None else max_batch
+        self._fits = self._max_batch
+        """Robots for which one inference is fast enough."""
+        self._longest_s = SHARE_OF_AGE * profile.timing.max_observation_age_s
         self._took_s = 0.0
-        """The last inference."""
+        """The last inference; less if it was for more robots than the next one may be."""
         self._policies = [policy]
         if len(robots) > 1:
             self._policies = self._one_for_each(policy, len(robots), another)
@@ -159,7 +166,7 @@ class WorkerNode:
         ready: list[Ready] = []
         late: list[Ready] = []
         for robot in due:
-            if len(ready) == self._max_batch:
+            if len(ready) == self._fits:
                 robot.poll()
                 continue
             observation = robot.observe()
@@ -170,7 +177,7 @@ class WorkerNode:
         ends_s = time.monotonic() + self._took_s
         if ready or any(robot.expects(ends_s) for robot in self.sessions):
             return ready
-        return late[: self._max_batch]
+        return late[: self._fits]
 
     def _wait(self, due: Sequence[RobotSession], stop: threading.Event) -> None:
         """Sleep until a robot is due or has sent its images, but only for a little while."""
@@ -198,7 +205,7 @@ class WorkerNode:
         answers = self._answers(ready)
         if self._delay_s:
             time.sleep(self._delay_s)
-        self._took_s = time.monotonic() - began_s
+        self._learn(len(ready), time.monotonic() - began_s)
         published: list[Any] = []
         for (robot, observation, observed_ns), answer in zip(ready, answers, strict=True):
             robot.due_s = max(robot.due_s + 1.0 / observation.task.requested_hz, began_s)
@@ -211,6 +218,13 @@ class WorkerNode:
                 published.append((robot, observation, answer, *chunk))
         for robot, *inference in published:
             self._debug[robot.robot].publish(*inference)
+
+    def _learn(self, count: int, took_s: float) -> None:
+        """Keep how long it took; a batch that is too slow, or the largest one, says what fits."""
+        if took_s > self._longest_s or count >= self._fits:
+            fits = int(count * self._longest_s / max(took_s, 1e-6))
+            self._fits = min(max(fits, 1), self._max_batch)
+        self._took_s = took_s * min(1.0, self._fits / count)
 
     def _answers(self, ready: Sequence[Ready]) -> list[ActionSteps | Exception]:
         try:
