@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from benchmark_rig import Reacher, own_benchmark, request
+from vla_zenoh_benchmarks.cli import BenchmarkEpisodes
 from vla_zenoh_benchmarks.contract import BenchmarkObservation
 from vla_zenoh_benchmarks.episode import EpisodeConditions, EpisodeOutcome
 from vla_zenoh_benchmarks.process import run_episode
@@ -97,3 +100,19 @@ def test_how_far_both_may_differ_is_told(tmp_path: Path) -> None:
     turned = Wrong(np.pi / 8)  # apart by 0.39 of the teacher's motion
     assert corrected(tmp_path / "loose", turned, 0.45)[0].taken_over_at is None
     assert corrected(tmp_path / "strict", turned, 0.35)[0].taken_over_at is not None
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"delay_ms": 100.0}, "--delay"),
+        ({"composition": "blend"}, "--composition"),
+        ({"takeover": TEACHER, "mode": "live"}, "--takeover"),
+        ({"disagreement": 0.5}, "--disagreement"),
+    ],
+)
+def test_an_option_without_the_one_it_belongs_to_is_an_error_that_names_both(
+    options: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(typer.BadParameter, match=f"^{named}: .*(add|leave out) --"):
+        BenchmarkEpisodes(**options).conditions  # noqa: B018

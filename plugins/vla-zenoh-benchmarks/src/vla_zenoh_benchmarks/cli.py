@@ -103,15 +103,15 @@ class BenchmarkEpisodes:
         ),
     ] = ""
     disagreement: Annotated[
-        float,
+        float | None,
         typer.Option(
             "--disagreement",
             min=0.0,
             max=10.0,
             help="With --takeover: difference of both motions within 0.25 s that is too large, as "
-            "a share of the watching model's.",
+            f"a share of the watching model's.  [default: {DISAGREEMENT:g}]",
         ),
-    ] = DISAGREEMENT
+    ] = None
 
     @property
     def conditions(self) -> EpisodeConditions:
@@ -125,8 +125,11 @@ class BenchmarkEpisodes:
             raise typer.BadParameter(
                 "--takeover: only where the environment waits; leave out --mode"
             )
+        if self.disagreement is not None and not self.takeover:
+            raise typer.BadParameter("--disagreement: with whom? add --takeover WORKER")
+        share = DISAGREEMENT if self.disagreement is None else self.disagreement
         own = (self.mode, self.delay_ms, self.replan, self.composition)
-        return EpisodeConditions(*own, disagreement=self.disagreement)
+        return EpisodeConditions(*own, disagreement=share)
 
     def requests(self, about: dict[str, Any]) -> list[EpisodeRequest]:
         known = [BenchmarkTask(**task) for task in about["tasks"]]
