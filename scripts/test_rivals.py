@@ -43,6 +43,17 @@ OF_FRANKA_NODE = (
 R2C = "R2C_PYTHON"
 """Environment variable with the Python that has R2C's client."""
 OF_R2C = ("hw-cloudrobo-r2c[client]==0.2.1",)
+TROSSEN = "TROSSEN_PYTHON"
+"""Environment variable with the Python that has the simulator of a WidowX AI."""
+TROSSEN_ARM = "trossen-arm==1.11.0"
+"""The maker's library: beside the simulator, and for our driver."""
+OF_TROSSEN = (
+    "mujoco==4.0.0",
+    "numpy==2.4.6",
+    TROSSEN_ARM,
+    "trossen-arm-sim==0.2.3",
+    "websockets==17.4",
+)
 
 
 def environment(
@@ -71,6 +82,15 @@ def environment(
     return str(python)
 
 
+def library(uv: str, environ: dict[str, str], package: str) -> str:
+    """Install a package alone, for our own Python, unless it is there; its folder."""
+    folder = TOOLS / "rivals" / package
+    if not folder.is_dir():
+        install = [uv, "--quiet", "pip", "install", "--python", sys.executable, "--no-deps"]
+        subprocess.run([*install, "--target", str(folder), package], env=environ, check=True)
+    return str(folder)
+
+
 def main() -> int:
     """Make the environments and run the tests; the exit status."""
     environ = uv_environment(os.environ)
@@ -81,6 +101,10 @@ def main() -> int:
         environ[FRANKA_NODE] = environment(uv, environ, "franka-node", (), OF_FRANKA_NODE)
     if R2C not in environ:
         environ[R2C] = environment(uv, environ, "r2c", (), OF_R2C)
+    if TROSSEN not in environ:
+        environ[TROSSEN] = environment(uv, environ, "trossen", (), OF_TROSSEN)
+    paths = library(uv, environ, TROSSEN_ARM), environ.get("PYTHONPATH", "")
+    environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     if SIMULATOR not in environ:
         environ[SIMULATOR] = simulator_environment(uv, environ, *PACKAGES)
     command = [sys.executable, "-m", "pytest", "-m", "rivals", "tests/rivals", *sys.argv[1:]]

@@ -26,7 +26,7 @@ from vla_zenoh_franka_node import wire
 
 from tests.franka import franka_rig
 
-DRIVER = Path(__file__).with_name("franka_node_driver_process.py")
+DRIVER = Path(__file__).with_name("driver_process.py")
 PROFILE = """
 extends: fr3_franka_node
 robot: {{command: {command}}}
@@ -137,7 +137,7 @@ def test_the_arm_rests_where_its_command_ended(lab: Lab, command: str) -> None:
     print(command, there)
     assert there["apart_m"] < APART_M
     assert there["apart_rad"] < APART_RAD
-    assert there["refused"] == there["not_sent"] == 0
+    assert there["detail"]["refused"] == there["detail"]["not_sent"] == 0
 
 
 def test_our_driver_killed_stops_the_arm(lab: Lab) -> None:

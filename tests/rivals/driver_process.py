@@ -1,8 +1,9 @@
-"""Our driver of an arm behind a franka-node, in a process that can be killed.
+"""Our driver of an arm, in a process that can be killed.
 
-    python franka_node_driver_process.py PROFILE
+    python driver_process.py PROFILE
 
-It moves the arm up by `WAY_M` and tells, one line each: ready, moving, there, and fault or lost.
+It moves the arm up by `WAY_M`, or its first joint by `TURN_RAD`, and tells, one line each: ready,
+moving, there, and fault or lost.
 """
 
 from __future__ import annotations
@@ -60,14 +61,15 @@ def run(mover: Mover) -> None:
         pass
     tell("ready")
     begin = mover.tick()
-    zero, still = np.zeros(6), np.zeros(7)
+    count = len(driver.profile.robot.arm_joints)
+    zero, still = np.zeros(6), np.zeros(count)
     began_s = time.monotonic()
     tell("moving")
     while True:
         elapsed_s = time.monotonic() - began_s
         share = 0.5 - 0.5 * np.cos(np.pi * min(1.0, elapsed_s / TIME_S))
         if driver.profile.robot.command == "joint":
-            goal_rad = begin.joints.position_rad + share * TURN_RAD * np.eye(7)[0]
+            goal_rad = begin.joints.position_rad + share * TURN_RAD * np.eye(count)[0]
             tcp = driver.forward(goal_rad)
             reference: Any = JointReference(goal_rad, still, still)
         else:
@@ -78,10 +80,7 @@ def run(mover: Mover) -> None:
             break
         if elapsed_s > TIME_S + SETTLE_S:
             apart_m, apart_rad = pose_distance(measured.tcp, tcp)
-            detail = driver.status().detail
-            counts = {name: detail[name] for name in ("accepted", "refused", "not_sent")}
-            rate = detail["control_command_success_rate"]
-            tell("there", apart_m=apart_m, apart_rad=apart_rad, success_rate=rate, **counts)
+            tell("there", apart_m=apart_m, apart_rad=apart_rad, detail=driver.status().detail)
             break
     while True:
         mover.tick()
