@@ -58,7 +58,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 def test_a_prompt_moves_the_arm_by_what_was_asked_for(lab: Lab) -> None:
     chain = lab.chain
     chain.activate_when_ready()
-    for prompt, way_m in (("up", [0, 0, STEPS * STEP_M]), ("left", [0, STEPS * STEP_M, 0])):
+    for prompt, way_m in (("up", [0, 0, STEPS * STEP_M]), ("down", [0, 0, -STEPS * STEP_M])):
         before_m = lab.tcp_m()
         chain.client.set_prompt("hold")
         chain.client.set_prompt(f"HARD: go {prompt} x{STEPS}")
@@ -76,7 +76,7 @@ def test_a_prompt_moves_the_arm_by_what_was_asked_for(lab: Lab) -> None:
 
 def test_the_router_killed_stops_the_arm(lab: Lab) -> None:
     chain = lab.chain
-    chain.client.set_prompt("HARD: go right")
+    chain.client.set_prompt("HARD: go up")
     chain.activate_when_ready()
     chain.until("the arm moves", chain.moves)
     pid = chain.pid("router")
