@@ -90,8 +90,8 @@ class RobotProfile(Section):
             robot; ``arm``: a Python file; ``franka``: a Franka arm over FCI; ``ur``: a UR arm over
             RTDE; ``lerobot``: a robot class of LeRobot; ``physicalai``: a robot that Intel's
             physicalai owns; ``franka_node``: a Franka arm behind franka-node; ``trossen``: a
-            WidowX AI; packages bring more. What it needs to know is in the section of its name. The node of ``sim`` and ``ros2``
-            has their name, that of all others is ``arm``.
+            WidowX AI; packages bring more. What it needs to know is in the section of its name.
+            The node of ``sim`` and ``ros2`` has their name, that of all others is ``arm``.
         command: set-points of the arm: ``pose`` of the TCP, for a Cartesian impedance controller,
             or ``joint`` positions.
         description: path of the URDF, or ``example-robot-data:`` and a path in that package.
