@@ -169,4 +169,6 @@ def _moved(file: Path) -> str:
     off_m = world.tcp()[0] - start_m - [0.0, 0.0, STEPS * STEP_M]
     if np.abs(off_m).max() < EXACT_M:
         return ""
-    return f"off by {', '.join(f'{1000 * each:.1f}' for each in off_m)} mm"
+    limits = [event for event in loop.events if event.kind == "limit"]
+    why = f": {limits[-1].what} {limits[-1].why}" if limits else ""
+    return f"off by {', '.join(f'{1000 * each:.1f}' for each in off_m)} mm{why}"

@@ -107,6 +107,22 @@ def test_a_hand_of_many_joints_is_left_still_by_name(tmp_path: Path) -> None:
     assert "finger0, finger1, finger2, finger3" in hand.why
 
 
+@pytest.mark.parametrize("joints_each", [2, 7])
+def test_three_branches_of_a_hand_are_no_arm_however_many_joints_they_have(
+    tmp_path: Path, joints_each: int
+) -> None:
+    path = tmp_path / "hand.urdf"
+    branches = [
+        Row(f"{name}{n}", axis=X, parent="" if n else "j6_link", at_m=(0.0, 0.0, 0.02))
+        for name in ("index", "middle", "ring")
+        for n in range(joints_each)
+    ]
+    path.write_text(urdf([*arm(SIX), TOOL, *branches]))
+    found = structure(Description(path), None, None)
+    assert (found.arm, found.tcp) == (JOINTS_6, "tcp")
+    assert len(found.fingers) == 3 * joints_each
+
+
 # -- what is mended -------------------------------------------------------------------------------
 MESH = '<mesh filename="package://away/link.stl"/>'
 BALL = '<sphere radius="0.02"/>'
@@ -143,6 +159,14 @@ def test_a_joint_without_a_velocity_gets_one_as_a_guess(tmp_path: Path, limit: s
     found, made = mended(tmp_path, urdf([*arm(SIX, j2=Row("j2", axis=Y, limit=limit)), TOOL]))
     assert found.joints["j2"].velocity == 1.0
     assert "velocity of j2: 1 rad/s" in made.guesses[0]
+
+
+def test_prefixes_without_a_namespace_are_left_out_and_said(tmp_path: Path) -> None:
+    text = urdf([*arm(SIX), TOOL]).replace("<limit ", '<limit drake:acceleration="2.5" ')
+    found, made = mended(tmp_path, text)
+    assert [*found.joints] == [*JOINTS_6, "tool"]
+    assert made.changes == ["drake: prefixes without a namespace, left out"]
+    assert made.guesses == []
 
 
 def test_a_link_whose_mesh_is_not_there_gets_a_plain_shape_as_a_guess(tmp_path: Path) -> None:

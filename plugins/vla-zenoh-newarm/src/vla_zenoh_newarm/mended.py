@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import tempfile
 import xml.etree.ElementTree as ElementTree
+import xml.parsers.expat as expat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -50,13 +51,16 @@ class Mended:
 
     def __init__(self, source: Path, arguments: Mapping[str, str], meshes: Path) -> None:
         self.source = source
-        root = _root(source)
+        root, undeclared = _root(source)
         self.changes: list[str] = []
+        if undeclared:
+            self.changes.append(f"{', '.join(undeclared)}: prefixes without a namespace, left out")
         if root is not None and root.tag == "mujoco":
             from vla_zenoh_newarm.mjcf import FromMjcf
 
             made = FromMjcf(source, meshes)
-            self._robot, self.changes = made.robot, made.changes
+            self._robot = made.robot
+            self.changes += made.changes
         elif root is not None and is_xacro(root):
             self._robot = _expanded(source, arguments)
             self.changes.append(f"{source.name} is a xacro: it was expanded")
@@ -92,12 +96,35 @@ class Mended:
         path.write_text(ElementTree.tostring(self._robot, encoding="unicode"), "utf-8")
 
 
-def _root(source: Path) -> ElementTree.Element | None:
-    """The outermost element of a file; None: there is none, and the reader of URDFs says why."""
+def _root(source: Path) -> tuple[ElementTree.Element | None, Sequence[str]]:
+    """The outermost element of a file, and prefixes in it that no namespace was declared for.
+
+    None: there is no element, and the reader of URDFs says why.
+    """
     try:
-        return ElementTree.parse(source).getroot()
-    except (OSError, ElementTree.ParseError):
-        return None
+        return ElementTree.parse(source).getroot(), ()
+    except OSError:
+        return None, ()
+    except ElementTree.ParseError:
+        return _without_prefixes(source)
+
+
+def _without_prefixes(source: Path) -> tuple[ElementTree.Element | None, Sequence[str]]:
+    """The same where prefixes mean nothing, as ROS's reader of URDFs takes them."""
+    builder, prefixes = ElementTree.TreeBuilder(), dict[str, None]()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        known = {name: value for name, value in attributes.items() if ":" not in name}
+        prefixes.update((name.split(":")[0], None) for name in (tag, *attributes) if ":" in name)
+        builder.start(tag, known)
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = start, builder.end
+    try:
+        parser.Parse(source.read_bytes(), True)
+        return builder.close(), [prefix for prefix in prefixes if prefix != "xmlns"]
+    except (expat.ExpatError, AssertionError):
+        return None, ()
 
 
 def _robot(source: Path, root: ElementTree.Element | None) -> ElementTree.Element:

@@ -13,6 +13,8 @@ MOST_JOINTS = 7
 """What lies before the last seven joints of a chain is a torso, rails or legs."""
 FINGER_JOINTS = 4
 """A branch with at most this many joints in a row may be a finger."""
+ARM_JOINTS, FINGERS = 5, 3
+"""After this many joints in a row this many branches of one body are fingers, however long."""
 FINGER = re.compile(r"finger|gripper|jaw|claw|knuckle|thumb|grip|pinch", re.IGNORECASE)
 TCP = re.compile(r"tcp|tool0|tool_?center|grasp|end_?effector|(^|_)ee(_|$)|eef|gripper_frame", re.I)
 FLANGE = re.compile(r"tool|flange|hand|palm|gripper", re.IGNORECASE)
@@ -125,7 +127,7 @@ class _Tree:
 
     def _is_finger(self, joint: DescribedJoint) -> bool:
         if self.depth(joint) > FINGER_JOINTS:
-            return False
+            return self._in_a_hand(joint)
         is_last = not any(self.is_own(each) for each in self.below(joint.child))
         if not self.is_own(joint):
             return is_last
@@ -136,13 +138,15 @@ class _Tree:
         return (joint.name in mimicked and is_last) or self._in_a_hand(joint)
 
     def _in_a_hand(self, joint: DescribedJoint) -> bool:
-        """Whether it begins one of several short branches of one body, after a real arm."""
+        """Whether it begins one of several branches of one body, after a real arm."""
         body = joint.parent
         way = list(self._described.chain(self._described.root, body))
         while way and not way[-1].moves:
             body = way.pop().parent
         siblings = [each for each in self._first_moving(body) if each.moves]
         short = all(self.depth(each) <= FINGER_JOINTS for each in siblings)
+        if len(siblings) >= FINGERS and self._own(way) >= ARM_JOINTS:
+            return True
         return len(siblings) > 1 and short and self._own(way) > 2
 
     def _first_moving(self, link: str) -> Iterator[DescribedJoint]:
