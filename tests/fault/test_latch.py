@@ -1,4 +1,4 @@
-"""An emergency stop outlives the command node that heard it."""
+"""An emergency stop outlives the command node that heard it, and so does what the gripper holds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ from chain import READY_PATIENCE_S, Chain
 from vla_zenoh.errors import SessionError
 
 
-def test_a_command_node_that_is_started_again_is_still_stopped(chain: Chain) -> None:
+def holds(chain: Chain) -> object:
+    status = chain.client.status("command")
+    return status and status.detail.get("gripper_holds", "")
+
+
+def test_a_command_node_that_is_started_again_is_still_stopped_and_knows_what_it_holds(
+    chain: Chain,
+) -> None:
+    chain.client.publish(chain.client.keys.held, "0.04 0.05 0.12")
+    chain.until("it holds the box", lambda: holds(chain) == "0.04 0.05 0.12")
     chain.client.publish(chain.client.keys.stop, "stop")
     chain.until("it stops", lambda: chain.state() == "stopped")
     old_pid = chain.pid("command")
@@ -26,6 +35,9 @@ def test_a_command_node_that_is_started_again_is_still_stopped(chain: Chain) -> 
         ),
         READY_PATIENCE_S,
     )
+    chain.until("it still holds the box", lambda: holds(chain) == "0.04 0.05 0.12")
+    chain.client.publish(chain.client.keys.held, "")
+    chain.until("it holds nothing", lambda: holds(chain) == "")
     assert robot_state(chain) == "latched"
     with pytest.raises(SessionError, match="stopped before this node was started"):
         chain.client.activate()

@@ -28,7 +28,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import RobotDriver
-from vla_zenoh.runtime.estop_latch import EstopLatch
+from vla_zenoh.runtime.kept_text import KeptText
 from vla_zenoh.runtime.process import realtime_thread
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event
@@ -73,7 +73,7 @@ class RobotNode:
         self._stops = node.subscribe(keys.stop, CallbackRing(HEARD, MAX_MESSAGE_BYTES))
         self._resets = node.subscribe(keys.reset, CallbackRing(HEARD, MAX_MESSAGE_BYTES))
         self._stop_put_ns = self._stop_came_ns = 0
-        self._latch = EstopLatch(latch)
+        self._latch = KeptText(latch)
         if self._latch.read() is not None:
             for arm in self.arms.values():
                 arm.latch_stop()

@@ -6,7 +6,7 @@ import pytest
 
 from vla_zenoh.cli.nodes import latch_file
 from vla_zenoh.profile import load_profile
-from vla_zenoh.runtime.estop_latch import EstopLatch
+from vla_zenoh.runtime.kept_text import KeptText
 from vla_zenoh.runtime.process import RUN_FOLDER_VARIABLE
 
 
@@ -17,15 +17,15 @@ def test_a_node_started_by_hand_finds_the_stop_of_the_one_before(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     profile = load_profile("panda_sim")
     for node in ("sim", "command"):
-        before = EstopLatch(latch_file(profile, node))
+        before = KeptText(latch_file(profile, node))
         before.set(f"stop of {node}")
         before.close()
     for node in ("sim", "command"):
-        again = EstopLatch(latch_file(profile, node))
+        again = KeptText(latch_file(profile, node))
         assert again.read() == f"stop of {node}"
         again.set(None)
         again.close()
-        assert EstopLatch(latch_file(profile, node)).read() is None
+        assert KeptText(latch_file(profile, node)).read() is None
 
 
 def test_robots_of_one_host_do_not_share_a_stop(

@@ -27,7 +27,7 @@ from vla_zenoh.profile import load_profile, override
 from vla_zenoh.robots import python_driver
 from vla_zenoh.robots.node import FAILURES, LEAST_S, RobotNode
 from vla_zenoh.robots.python_driver import PythonDriver
-from vla_zenoh.runtime.estop_latch import EstopLatch
+from vla_zenoh.runtime.kept_text import KeptText
 from vla_zenoh.types import (
     Event,
     FloatArray,
@@ -507,7 +507,7 @@ def test_a_stop_outlives_the_robot_node_that_heard_it(
     turns: Turns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     latch = tmp_path / "stopped-arm"
-    turns.node._latch = EstopLatch(latch)
+    turns.node._latch = KeptText(latch)
     turns.session.put(turns.node.node.keys.stop, "stop")
     turns.node.step(turns.wait())
     until("the latch is written", latch.exists)

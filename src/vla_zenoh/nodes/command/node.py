@@ -7,7 +7,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +16,22 @@ import zenoh
 from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.codec import records
+from vla_zenoh.codec import records, settings
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander import Commander, Outputs, Setting
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import State
+from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
 from vla_zenoh.profile import Profile
-from vla_zenoh.runtime.estop_latch import EstopLatch
+from vla_zenoh.runtime.kept_text import KeptText
 from vla_zenoh.runtime.process import realtime_thread
 from vla_zenoh.types import LATENCY_STAGES, Cause, Event
 
 TASK_PERIOD_S = 0.2
+HOLDS = "what the gripper holds"
 BRAKE_BEFORE_EXIT_S = 1.0
 SWITCH_INTERVAL_S = 5e-4
 MAX_WHY, MAX_LIMIT = 2000, 200
@@ -61,7 +63,7 @@ class CommandNode:
         profile, session: the caller closes the session.
         dry_run: compute everything, publish no command.
         latch: file that exists while an emergency stop or a fault is latched, so that a restarted
-            command node is stopped as well.
+            command node is stopped as well; beside it is a file of what each gripper holds.
     """
 
     def __init__(
@@ -77,10 +79,15 @@ class CommandNode:
         reach = {name: ReachabilityFilter(part) for name, part in parts.items()}
         node = self.node = Node("command", profile, session)
         self.commander = Commander(profile, reach=reach, dry_run=dry_run)
-        self._latch = EstopLatch(latch)
+        self._latch = KeptText(latch)
         before = self._latch.read()
         if before is not None:
             self.commander.latch(f"stopped before this node was started: {before}")
+        self._holds = {
+            name: KeptText(latch and latch.with_name(f"{latch.name}-holds{name}"), HOLDS)
+            for name in parts
+        }
+        self._restored = [*self._held_before()]
         keys = node.keys
         self._inputs = CommandInputs(node)
         self._status = CommandStatus(node, self.commander)
@@ -96,6 +103,23 @@ class CommandNode:
         self._last_task = 0.0
         self._next_chores_ns = self._busy_ns = 0
         self._serve_settings()
+
+    def _held_before(self) -> Iterator[Setting]:
+        """What the grippers held when the node before this one ended."""
+        for name, kept in self._holds.items():
+            text = kept.read()
+            try:
+                box = settings.decode_held((text or "").encode())
+            except CodecError as error:
+                why = f"{HOLDS} is not known any more: {error}; put it again"
+                self.node.emit(Event("error", "fault", "held", why))
+                continue
+            if box:
+                yield Setting("held", box, part=name)
+
+    def _keep_held(self) -> None:
+        for part in self.commander.parts:
+            self._holds[part.name].set(None if part.held is None else str(part.held))
 
     def _serve_settings(self) -> None:
         commander, keys = self.commander, self.node.keys
@@ -124,7 +148,8 @@ class CommandNode:
             with realtime_thread() as self._status.realtime:
                 self._loop(stop)
         finally:
-            self._latch.close()
+            for kept in (self._latch, *self._holds.values()):
+                kept.close()
             self.node.publish_end()
             self.node.close()
             gc.unfreeze()  # so that the interpreter frees everything at exit
@@ -182,7 +207,8 @@ class CommandNode:
         if chores:
             self._next_chores_ns = tick.nominal_ns + round(CHORES_S * 1e9)
         inputs = self._inputs.poll(now_ns, take_chunks=take_chunks)
-        inputs.settings = [*inputs.settings, *extra]
+        inputs.settings = [*self._restored, *inputs.settings, *extra]
+        self._restored = []
         timing = self.node.profile.timing
         limit = max(1, int(timing.command_timeout_s * timing.command_hz))
         out = self.commander.step(inputs, now_ns, min(tick.periods, limit))
@@ -192,11 +218,15 @@ class CommandNode:
         if any(event.kind == "transition" for event in out.events):
             latched = self.commander.state in (State.STOPPED, State.FAULT)
             self._latch.set(self.commander.why if latched else None)
+        if any(event.what == "gripper_holds" for event in out.events):
+            self._keep_held()
         if chores:
             self._inputs.read_news(now_ns)
         if chores or out.events or out.task_changed:
-            why = self._latch.failure()
-            if why is not None:
+            for kept in (self._latch, *self._holds.values()):
+                why = kept.failure()
+                if why is None:
+                    continue
                 self.node.counters["command.latch_failed"] += 1
                 self.node.emit(Event("error", "fault", "latch", why))
             self._status.publish(out, self._inputs.chunks.dropped)

@@ -1,4 +1,4 @@
-"""File that exists while an emergency stop or a fault is latched."""
+"""A text that outlives its node: why it is stopped, or what its gripper holds."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from pathlib import Path
 FLUSH_S = 0.5
 
 
-class EstopLatch:
-    """Latch file with a thread that writes: a full or slow disk must not block the command loop.
+class KeptText:
+    """A file, or none, with a thread that writes: a slow disk must not block the command loop.
 
     Args:
-        path: of the file; None: a restarted node is not latched.
+        path: of the file; None: a restarted node knows nothing.
+        about: what the text says, for the message that it could not be kept.
     """
 
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
+    def __init__(self, path: Path | None, about: str = "whether it is stopped") -> None:
+        self._path, self._about = path, about
         self._wanted: queue.SimpleQueue[str | threading.Event | None] = queue.SimpleQueue()
         self._failures: queue.SimpleQueue[str] = queue.SimpleQueue()
-        threading.Thread(target=self._run, name="latch", daemon=True).start()
+        threading.Thread(target=self._run, name="keeper", daemon=True).start()
 
     def read(self) -> str | None:
-        """Why it is latched; None if it is not. A file that cannot be read counts as latched."""
+        """The text; None: there is none. Of a file that cannot be read, why not."""
         if self._path is None:
             return None
         try:
@@ -34,9 +35,9 @@ class EstopLatch:
         except OSError as error:
             return f"{self._path} cannot be read: {error}"
 
-    def set(self, why: str | None) -> None:
-        """Latch for a reason, or clear the latch (None); returns at once."""
-        self._wanted.put(why)
+    def set(self, text: str | None) -> None:
+        """Keep a text in place of the last one, or none; returns at once."""
+        self._wanted.put(text)
 
     def failure(self) -> str | None:
         """What went wrong since the last call, one at a time."""
@@ -69,5 +70,5 @@ class EstopLatch:
                 done = "removed" if wanted is None else "written"
                 self._failures.put(
                     f"{self._path} cannot be {done} ({error}): a restarted node "
-                    "will not know whether it is stopped"
+                    f"will not know {self._about}"
                 )
