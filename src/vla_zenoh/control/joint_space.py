@@ -62,7 +62,7 @@ NAMED = {"rad": "radians", "m": "metres"}
 """Units of joints in sentences."""
 NEARER_M = 5e-4
 """m by which a motion may come nearer than a stop: goals are bounded step by step."""
-CHECK_TICKS, CHECK_S = 4, 0.016
+CHECK_S = 0.016
 """Between two checks of distances at most, which cost too much for every tick; they look as far
 ahead, and the joints get faster until then."""
 PROBE_RAD = 0.01
@@ -273,7 +273,7 @@ class JointPath(AxisSmoother):
         self._names = bounds.kinematics.arm_joints
         self._tcp_box = motion_limits(profile.limits).box
         self._ticks = 0
-        self._check_ticks = min(max(round(CHECK_S * profile.timing.command_hz), 1), CHECK_TICKS)
+        self._check_ticks = max(round(CHECK_S * profile.timing.command_hz), 1)
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
         self._before_bound = False

@@ -32,8 +32,8 @@ from vla_zenoh.types import FloatArray
 NAME = "part_distance"
 """Of the limit."""
 SPACED_M = 0.25
-"""Arms this much further apart than they may come are looked at now and then."""
-FAR_TICKS = 4
+"""Arms this much further apart than they may come are looked at every `FAR_S` only."""
+FAR_S = 0.016
 NOISE_M = 2e-5
 """Distances of the same joints differ by less: without it arms at the stop could not go on."""
 SPARE_M = 5e-3
@@ -62,6 +62,7 @@ class PartSpacing:
         self._within_m = max(self._slow_m, self._stop_m) + SPACED_M
         self.nearest = Nearest(self._within_m)
         """Distance of the commanded joints when last computed."""
+        self._rate_hz = profile.timing.command_hz
         self._skip = 0
         self._held = self._slower = False
         self._reached_m = -np.inf
@@ -100,7 +101,7 @@ class PartSpacing:
             return None, None
         before, self.nearest = self.nearest, self._nearest(at)
         if self.nearest.distance_m >= self._within_m:
-            self._skip, self._held = FAR_TICKS - 1, False
+            self._skip, self._held = max(round(FAR_S * self._rate_hz), 1) - 1, False
             return None, None
         floor_m = self._floor_m(self.nearest.distance_m)
         stops = [part.motion.stopping_rad(ahead_s) for part in self._parts]

@@ -20,7 +20,7 @@ from vla_zenoh.control.joint_follower import (
     JointFollower,
     JointMotion,
 )
-from vla_zenoh.control.joint_space import BEND, CHECK_TICKS, followed_shares
+from vla_zenoh.control.joint_space import BEND, CHECK_S, followed_shares
 from vla_zenoh.control.limits import (
     FULL,
     Shares,
@@ -194,7 +194,7 @@ class PoseToJoint:
         """
         here = self._kinematics.forward(self._now.position_rad)
         lag = self._lag(here, smoother.motion.pose)
-        if self._ticks % CHECK_TICKS == 0:
+        if self._ticks % max(round(CHECK_S / self._dt_s), 1) == 0:
             self._constraints.update(self._now.position_rad)
         self._ticks += 1
         # Held joints approach a standing pose for as long as it takes.
