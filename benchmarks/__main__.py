@@ -15,9 +15,11 @@ from benchmarks.depth import depth
 from benchmarks.flywheel.cli import flywheel
 from benchmarks.footprint import footprint
 from benchmarks.load.cli import load
+from benchmarks.load.serving import serving
 from benchmarks.motion.cli import motion
 from benchmarks.openvla import openvla
 from benchmarks.readers import readers
+from benchmarks.rest import rest
 from benchmarks.stop import stop
 from benchmarks.thesis.cli import thesis
 from benchmarks.web import web
@@ -43,6 +45,8 @@ COMMANDS = (
     motion,
     openvla,
     readers,
+    rest,
+    serving,
     stop,
     thesis,
     web,

@@ -1,8 +1,8 @@
 """Processes of a benchmark: how its servers are started, watched, timed and ended.
 
-Run as a module it is such a process: ``peer NAME PORT``, ``router ENDPOINT``,
-``echo ENDPOINT listen|connect CAMERAS``, ``robot PROFILE_FILE`` or
-``follower PROFILE_FILE``.
+Run as a module it is such a process: ``peer NAME PORT [SECONDS]``, ``router ENDPOINT``,
+``echo ENDPOINT listen|connect CAMERAS``, ``robot PROFILE_FILE``,
+``follower PROFILE_FILE`` or ``plain PLAN_FILE``.
 """
 
 from __future__ import annotations
@@ -109,11 +109,11 @@ def main(arguments: list[str]) -> None:
     """Run the process that `arguments` name."""
     role, *rest = arguments
     if role == "peer":
-        name, port = rest
+        name, port, takes_s = (*rest, "0")[:3]
         # Ctrl-C reaches the parent alone, which ends this one by SIGTERM: that is no error.
         signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
         die_with_parent()
-        peers.load(name).serve(int(port))
+        peers.load(name).serve(int(port), float(takes_s))
         return
     stop = stop_on_signals()
     die_with_parent()
@@ -131,6 +131,10 @@ def main(arguments: list[str]) -> None:
         from benchmarks.chain.robot import play_robot
 
         play_robot(rest[0], stop, follows=role == "follower")
+    elif role == "plain":
+        from benchmarks.rest import play_plain
+
+        play_plain(rest[0], stop)
     else:
         raise NodeError(f"{role!r} is no part of a benchmark")
 

@@ -1,7 +1,8 @@
 """Other ways of serving a policy, each as it is commonly done: a server and its client.
 
-A module here has ``serve(port)``, which ends with its process, and ``Client(port)`` with
-``request(pictures)``, which returns the seven floats.
+A module here has ``serve(port, takes_s)``, which ends with its process, and ``Client(port)`` with
+``request(pictures)``, which returns the seven floats. An inference takes `takes_s`; there is one at
+a time, as on one GPU.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class PeerClient(Protocol):
 class Peer(Protocol):
     """A module of this package."""
 
-    def serve(self, port: int) -> None: ...
+    def serve(self, port: int, takes_s: float) -> None: ...
 
     def Client(self, port: int) -> PeerClient: ...
 

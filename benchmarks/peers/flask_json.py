@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import logging
+import threading
+import time
 from typing import Any
 
 import cv2
@@ -18,10 +20,10 @@ from benchmarks.peers import ACTION, ADDRESS, PROMPT, Pictures
 TIMEOUT_S = 10.0
 
 
-def serve(port: int) -> None:
+def serve(port: int, takes_s: float) -> None:
     """Answer until the process ends."""
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    app = flask.Flask(__name__)
+    app, gpu = flask.Flask(__name__), threading.Lock()
 
     @app.post("/act")
     def act() -> Any:
@@ -32,6 +34,8 @@ def serve(port: int) -> None:
             if bgr is None:
                 return {"error": "not a picture"}, 400
             cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+        with gpu:
+            time.sleep(takes_s)
         return {"action": list(ACTION)}
 
     make_server(ADDRESS, port, app, threaded=True).serve_forever()  # what app.run() does

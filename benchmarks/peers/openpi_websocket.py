@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,26 +18,28 @@ from websockets.sync.client import connect
 from benchmarks.peers import ACTION, ADDRESS, PROMPT, Pictures, arrays
 
 
-async def _answer(connection: ServerConnection) -> None:
+async def _answer(connection: ServerConnection, takes_s: float) -> None:
     await connection.send(arrays.pack({}))  # the server's description of itself comes first
     actions = np.array([ACTION], np.float32)
     try:
         while True:
             asked = arrays.unpack(await connection.recv())  # pyright: ignore[reportArgumentType]
             assert all(asked[name].ndim == 3 for name in asked if name.startswith("observation/"))
+            time.sleep(takes_s)  # as there: inference holds up every client
             await connection.send(arrays.pack({"actions": actions, "server_timing": {}}))
     except ConnectionClosed:
         return
 
 
-async def _serve(port: int) -> None:
-    async with listen(_answer, ADDRESS, port, compression=None, max_size=None) as server:
+async def _serve(port: int, takes_s: float) -> None:
+    answer = partial(_answer, takes_s=takes_s)
+    async with listen(answer, ADDRESS, port, compression=None, max_size=None) as server:
         await server.serve_forever()
 
 
-def serve(port: int) -> None:
+def serve(port: int, takes_s: float) -> None:
     """Answer until the process ends."""
-    asyncio.run(_serve(port))
+    asyncio.run(_serve(port, takes_s))
 
 
 class Client:

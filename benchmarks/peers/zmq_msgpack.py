@@ -1,7 +1,8 @@
-"""ZeroMQ REQ/REP over TCP, arrays in msgpack."""
+"""ZeroMQ REQ/REP over TCP, arrays in msgpack: as GR00T's server, it has one request at a time."""
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from benchmarks.peers import ACTION, ADDRESS, PROMPT, Pictures, arrays
 TIMEOUT_MS = 10_000
 
 
-def serve(port: int) -> None:
+def serve(port: int, takes_s: float) -> None:
     """Answer until the process ends."""
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
     socket.bind(f"tcp://{ADDRESS}:{port}")
@@ -21,6 +22,7 @@ def serve(port: int) -> None:
     while True:
         asked = arrays.unpack(socket.recv())
         assert all(image.ndim == 3 for image in asked["images"])
+        time.sleep(takes_s)
         socket.send(arrays.pack({"actions": actions}))
 
 
