@@ -9,6 +9,7 @@ import re
 import signal
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from vla_zenoh_web.hold import HOLD_S
 from web_rig import (
     METRICS,
     OPERATOR,
+    PEOPLE,
     VIEWER,
     Browser,
     Site,
@@ -41,6 +43,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 GARBAGE = 10_000
 STILL_MM = 2.0
 STOPS = 4
+SHOWN_OUT_S = 10.0
+"""The file is looked at once a second; a minute is the promise."""
 END_S = 90.0
 """An export of one short episode on a busy computer."""
 BRAKE_S = 0.5
@@ -179,6 +183,31 @@ def test_a_killed_server_brakes_the_arm(chain: Chain, site: Site) -> None:
         second.process.wait()
         chain.until("inactive", lambda: chain.state() == "inactive")
     chain.wait_still()
+
+
+def test_who_is_taken_out_of_the_file_is_shown_out_and_the_arm_brakes(
+    chain: Chain, tmp_path: Path
+) -> None:
+    people = write_people(tmp_path)
+    with (
+        serving(chain.profile_file, people) as own,
+        browsing(own) as browser,
+        browsing(own, VIEWER) as other,
+    ):
+        hold_until_it_moves(chain, browser)
+        began_s = time.monotonic()
+        write_people(tmp_path, {name: one for name, one in PEOPLE.items() if name != "anna"})
+        until("she is shown out", browser.closed.is_set, SHOWN_OUT_S)
+        chain.until("inactive", lambda: chain.state() == "inactive")
+        chain.wait_still()
+        print(f"out, and the arm stands, after {time.monotonic() - began_s:.2f} s")
+        assert "no longer among the people" in browser.answers("denied")[0]["why"]
+        again = Browser(own)
+        again.wait("denied")
+        again.close()
+        ours = {"Origin": f"http://{own.host}", "Authorization": f"Bearer {OPERATOR}"}
+        assert own.ask("POST", "/stop", ours)[0] == 403
+        assert not other.closed.is_set()
 
 
 def test_only_one_page_holds(chain: Chain, site: Site) -> None:

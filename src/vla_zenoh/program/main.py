@@ -126,7 +126,9 @@ COMMANDS: Panels = {
         "secure": CommandGroup(
             "Certificates for a lab, so that only its hosts connect, with the rights of their "
             "roles.",
-            dict.fromkeys(("init", "add", "here", "show"), OF_A_PACKAGE),
+            dict.fromkeys(
+                ("init", "add", "here", "show", "revoke", "retire", "rename"), OF_A_PACKAGE
+            ),
         ),
         "dataset": CommandGroup(
             "Turn recorded runs into training data.",

@@ -7,6 +7,7 @@ import os
 import socket
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import zenoh
@@ -14,13 +15,17 @@ import zenoh
 from vla_zenoh.bus.bounded import Bounded
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session, session_config
-from vla_zenoh.errors import NodeError
+from vla_zenoh.errors import NodeError, SecurityError
 from vla_zenoh.profile import Profile
+from vla_zenoh.profile.load import as_robot
 from vla_zenoh.profile.schema import address_of, is_loopback
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
+from vla_zenoh.security.names import UNCHANGED, Names, read_names
 from vla_zenoh.security.roles import access_control
+from vla_zenoh.security.store import Store
 
 POLL_S = 0.25
+REOPEN_S = 10.0
 MAX_CLIENTS = 64
 RUNTIME_VARIABLE, RUNTIME = "ZENOH_RUNTIME", "(rx: (worker_threads: 16))"
 """A sample is forwarded by the thread that received it, which blocks on a stuck link. With Zenoh's
@@ -36,30 +41,56 @@ def run_router(
 ) -> None:
     """Run a Zenoh router until `stop` is set, which serves the robots `also` as well.
 
+    Zenoh reads its access rules when a session opens. So whenever names are revoked, renamed or
+    retired it closes all links and opens anew: active arms brake, and wait to be activated.
+
     `host` is the name of this one; it matters if several have a router.
 
     Raises:
-        SecurityError: the router's certificate is missing.
+        SecurityError: the router's certificate is missing, or the names cannot be read.
         SessionError: the address is in use.
     """
-    profile, options = _session_of(profile, host, also)
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
-    with open_session(profile.session, **options) as session:
-        node = Node(options["identity"], profile, session, host=host, routes=True)
-        expiry = CertificateExpiry(profile.session.security)
-        clients = Clients(session)
-        detail: dict[str, Any] = {"listen": list(profile.session.listen)}
+    wait_s = 0.0
+    while not stop.is_set():
+        names = _names(profile)
+        seen, options = _session_of(profile, host, also, names)
+        with open_session(seen.session, **options, wait_s=wait_s, stop=stop) as session:
+            node = Node(options["identity"], seen, session, host=host, routes=True)
+            _route(node, names, stop)
+            node.close()
+        wait_s = REOPEN_S
+
+
+def _route(node: Node, names: Names, stop: threading.Event) -> None:
+    """Report, until `stop` is set or there are newer names."""
+    profile, session = node.profile, node.session
+    expiry = CertificateExpiry(profile.session.security)
+    clients = Clients(session)
+    detail: dict[str, Any] = {"listen": list(profile.session.listen)}
+    if profile.session.security is not None:
+        # Certificates are required.
+        detail |= {"security": "tls", "names": names.revision}
+    else:
+        here = all(map(is_loopback, profile.session.listen))
+        detail["security"] = "loopback" if here else "insecure"
+    while not stop.wait(POLL_S):
+        detail |= {"clients": clients.known(), "links": len(list(session.info.links()))}
         if profile.session.security is not None:
-            detail["security"] = "tls"  # certificates are required
-        else:
-            here = all(map(is_loopback, profile.session.listen))
-            detail["security"] = "loopback" if here else "insecure"
-        while not stop.wait(POLL_S):
-            detail |= {"clients": clients.known(), "links": len(list(session.info.links()))}
-            if profile.session.security is not None:
-                detail["certificates"] = expiry.outlook._asdict()
-            node.publish_status("routing", detail=detail)
-        node.close()
+            detail["certificates"] = expiry.outlook._asdict()
+        node.publish_status("routing", detail=detail)
+        with suppress(SecurityError):  # it is being copied
+            if _names(profile).revision > names.revision:
+                return
+
+
+def _names(profile: Profile) -> Names:
+    """Names that changed in a secured lab, noted beside the router's certificate."""
+    security = profile.session.security
+    if security is None:
+        return UNCHANGED
+    store = Store(security.folder)
+    return read_names(store.folder / store.this_host(security.host))
 
 
 class Clients:
@@ -121,15 +152,24 @@ def router_config(
     Raises:
         SecurityError: the router's certificate is missing.
     """
-    profile, options = _session_of(profile, host, also)
+    profile, options = _session_of(profile, host, also, _names(profile))
     return session_config(profile.session, **options)
 
 
 def _session_of(
-    profile: Profile, host: str | None, also: Sequence[Profile]
+    profile: Profile, host: str | None, also: Sequence[Profile], names: Names
 ) -> tuple[Profile, dict[str, Any]]:
-    """The profile as seen from `host`, and the router's options for `open_session`."""
-    access = None if profile.session.security is None else access_control((profile, *also))
+    """The profile as seen from `host`, and the router's options for `open_session`.
+
+    The router of a retired robot reports to the next one: nobody may hear the former.
+    """
+    served = [
+        as_robot(each, now)
+        for each in (profile, *also)
+        if (now := names.robots.get(each.robot.name, each.robot.name))
+    ]
+    access = None if profile.session.security is None else access_control(served, names)
+    profile = as_robot(profile, served[0].robot.name) if served else profile
     options: dict[str, Any] = {"mode": "router", "identity": "router", "access": access}
     if host is None:
         hosts = [name for name, part in profile.hosts.items() if "router" in part.nodes]

@@ -11,6 +11,7 @@ from typing import Any
 
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS, host_of, is_loopback
+from vla_zenoh.security.names import Names
 from vla_zenoh.security.roles import EVERY_MESSAGE, IN, OUT, Identity, Role, rule
 from vla_zenoh.security.store import AUTHORITY
 
@@ -40,12 +41,12 @@ def bridges(profile: Profile, host: str | None = None) -> list[Identity]:
     ]
 
 
-def bridge_locks(profile: Profile, folder: Path) -> dict[str, Any]:
+def bridge_locks(profile: Profile, folder: Path, names: Names) -> dict[str, Any]:
     """Zenoh's sections ``transport`` and ``access_control`` for the bridge.
 
     On its computer `folder` has ``ca.pem``, ``bridge.pem`` and ``bridge.key``.
     """
-    names = [f"{USER}@{host}" for host in _users(profile)]
+    users = [names.current(f"{USER}@{host}") for host in _users(profile)]
     return {
         "transport": {
             "link": {
@@ -62,7 +63,7 @@ def bridge_locks(profile: Profile, folder: Path) -> dict[str, Any]:
             "enabled": True,
             "default_permission": "deny",
             "rules": [rule(USER, (IN, OUT), EVERY_MESSAGE, KEYS)],
-            "subjects": [{"id": USER, "cert_common_names": names}],
+            "subjects": [{"id": USER, "cert_common_names": users}],
             "policies": [{"rules": [USER], "subjects": [USER]}],
         },
     }

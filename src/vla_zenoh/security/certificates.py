@@ -15,6 +15,7 @@ from pathlib import Path
 from vla_zenoh.errors import MissingExtraError, SecurityError, counted
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.bridge import bridges
+from vla_zenoh.security.names import read_names
 from vla_zenoh.security.roles import identities
 from vla_zenoh.security.store import AUTHORITY, Store, open_to_others
 
@@ -95,8 +96,10 @@ class CheckedStore(Store):
             warning = found.warning(now)
             if not signed_by(pem, read_file(signer)):
                 faults.append("was signed by another authority")
-            if host and found.common_name != f"{node}@{host}":
-                faults.append(f"is about {found.common_name!r}")
+            if host and found.common_name != (
+                valid := read_names(path.parent).current(f"{node}@{host}")
+            ):
+                faults.append(f"is about {found.common_name!r}, and {valid!r} has the rights")
             if key.exists():
                 faults.append(open_to_others(key))
                 own, private = load_pair(pem, read_file(key))

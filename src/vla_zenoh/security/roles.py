@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import KEY_PATHS, NODE_KINDS, PRIMITIVES, ROLLING, Keys, worker_node
+from vla_zenoh.security.names import UNCHANGED, Names
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
@@ -68,7 +69,7 @@ class Identity:
 
     @property
     def common_name(self) -> str:
-        """As in its certificate."""
+        """As in its certificate, unless `Names.current` says otherwise."""
         return f"{self.node}@{self.host}"
 
 
@@ -313,7 +314,7 @@ MESSAGES: Mapping[Act, Sequence[tuple[str, str]]] = {
 EVERY_MESSAGE = tuple(dict.fromkeys(message for ways in MESSAGES.values() for _, message in ways))
 
 
-def access_control(profiles: Iterable[Profile]) -> dict[str, Any]:
+def access_control(profiles: Iterable[Profile], names: Names = UNCHANGED) -> dict[str, Any]:
     """Zenoh's section ``access_control`` for a router that serves the robots of these profiles.
 
     Whatever is not named is denied.
@@ -330,7 +331,9 @@ def access_control(profiles: Iterable[Profile]) -> dict[str, Any]:
         "enabled": True,
         "default_permission": "deny",
         "rules": list(rules.values()),
-        "subjects": [{"id": name, "cert_common_names": [name]} for name in of_subject],
+        "subjects": [
+            {"id": name, "cert_common_names": [names.current(name)]} for name in of_subject
+        ],
         "policies": [{"rules": list(own), "subjects": [name]} for name, own in of_subject.items()],
     }
 

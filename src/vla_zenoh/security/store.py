@@ -5,6 +5,7 @@
     FOLDER/ca.pem, ca.key         authority; its key never leaves this computer
     FOLDER/HOST/ca.pem            copy FOLDER/HOST to that host, into its own FOLDER
     FOLDER/HOST/NODE.pem, .key    certificate and key of each node and operator of the host
+    FOLDER/HOST/names.json        names that changed, see `names`
     FOLDER/.this_host             name of the HOST that this computer is; not copied
 
 Private keys are readable by their owner only. `certificates` checks, and

@@ -71,6 +71,37 @@ def test_a_name_that_is_taken_or_none_is_not_invited(name: str, named: str) -> N
     assert people.find("x" * 16) is None
 
 
+def test_who_is_taken_out_of_the_file_is_out_and_whoever_was_invited_stays(tmp_path: Path) -> None:
+    both = f'anna: {{role: operator, token: "{ANNA.token}"}}\n'
+    both += f'wall: {{role: viewer, token: "{WALL.token}"}}\n'
+    file = people_file(tmp_path, both)
+    people = People(read_people(file), file=file)
+    bob = people.invite("bob", "viewer", "bob's own token!")
+    assert not people.reread()
+    assert people.has(ANNA)
+    people_file(tmp_path, both.splitlines()[1])
+    assert people.reread()
+    assert not people.has(ANNA)
+    assert people.find(ANNA.token) is None
+    assert people.has(WALL)
+    assert people.has(bob)
+    # A lower role is another person's.
+    people_file(tmp_path, both.replace("operator", "viewer"))
+    assert people.reread()
+    assert not people.has(ANNA)
+    assert people.has(ANNA._replace(role="viewer"))
+
+
+def test_a_file_that_is_being_written_shows_nobody_out(tmp_path: Path) -> None:
+    file = people_file(tmp_path, f'anna: {{role: operator, token: "{ANNA.token}"}}\n')
+    people = People(read_people(file), file=file)
+    people_file(tmp_path, "anna: {role: oper")
+    with pytest.raises(SecurityError, match=r"people\.yaml"):
+        people.reread()
+    assert people.has(ANNA)
+    assert not people.reread()  # it is told once
+
+
 def test_people_are_invited_up_to_a_number() -> None:
     people = People([ANNA])
     for number in range(MAX_PEOPLE - 1):

@@ -21,6 +21,7 @@ from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.program.main import app
 from vla_zenoh.security import certificates
 from vla_zenoh.security.bridge import bridge_locks, bridges
+from vla_zenoh.security.names import Names
 from vla_zenoh.security.roles import Act, Role
 
 RUNNER = CliRunner()
@@ -258,7 +259,7 @@ def test_a_bridge_on_another_computer_gets_a_certificate_and_serves_the_node_alo
 
 def test_the_node_may_announce_itself_to_the_bridge(tmp_path: Path) -> None:
     profile = load_profile("panda_ros2")
-    rules = bridge_locks(profile, tmp_path)["access_control"]
+    rules = bridge_locks(profile, tmp_path, Names())["access_control"]
     token = Ros2Dds("abc", None).node_token()
     for passage in passages(Act.ANNOUNCE, token):
         assert allows(rules, "ros2@here", passage), passage

@@ -64,6 +64,7 @@ def bridge_config(
 def _locks(profile: Profile, given: Path | None) -> tuple[dict[str, object], str]:
     """The bridge's sections for certificates and access, and how to copy the certificates."""
     from vla_zenoh.security.bridge import NODE, bridge_locks, bridges
+    from vla_zenoh.security.names import read_names
     from vla_zenoh.security.store import Store
 
     assert profile.session.security is not None
@@ -74,8 +75,10 @@ def _locks(profile: Profile, given: Path | None) -> tuple[dict[str, object], str
     folder = (given or source).expanduser()
     if not folder.is_absolute():
         raise typer.BadParameter("--certificates wants an absolute path, from / or ~")
-    names = " ".join(str(source / name) for name in ("ca.pem", f"{NODE}.pem", f"{NODE}.key"))
-    return bridge_locks(profile, folder), (
-        f"It accepts only node ros2@{hosts[0]}, by certificate. If it is another computer:\n"
-        f"  ssh ROBOT mkdir -p -m 700 {folder}\n  scp -p {names} ROBOT:{folder}/"
+    files = " ".join(str(source / name) for name in ("ca.pem", f"{NODE}.pem", f"{NODE}.key"))
+    names = read_names(store.folder)
+    user = names.current(f"ros2@{hosts[0]}")
+    return bridge_locks(profile, folder, names), (
+        f"It accepts only node {user}, by certificate. If it is another computer:\n"
+        f"  ssh ROBOT mkdir -p -m 700 {folder}\n  scp -p {files} ROBOT:{folder}/"
     )

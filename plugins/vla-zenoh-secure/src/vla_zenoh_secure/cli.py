@@ -191,7 +191,7 @@ def init(
     if plain.session.security is not None:
         fail(f"profile {plain.name} is already secured; `vla-zenoh secure add HOST` adds to it")
     file = output or Path(f"{plain.name}_secure.yaml")
-    store, now = LabCertificates(folder or DEFAULT_FOLDER), _now()
+    store, now = LabCertificates(folder or DEFAULT_FOLDER), now_utc()
     addresses = _router_addresses(at or ())
     endpoints = moved_hosts(plain, addresses)
     text = profile_text(plain, _extends(profile, file), store.folder.absolute(), endpoints)
@@ -268,15 +268,13 @@ def add(
             chosen = [*(one for one in nodes if one.node not in names), *chosen]
     else:
         chosen = [*identities_of(loaded, host), *bridges(loaded, host)]
-    store = LabCertificates(security.folder)
-    made = store.add(
-        chosen, _now(), days=days, addresses=serving_addresses(loaded, address or ()), renew=renew
-    )
+    store, serving = LabCertificates(security.folder), serving_addresses(loaded, address or ())
+    made = store.add(chosen, now_utc(), days=days, addresses=serving, renew=renew)
     if new:
         with output_file(profile_file(profile), force=True) as part:
             part.write_text(new, "utf-8")
         loaded = load_profile(profile)
-    for path, why in unused_certificates(loaded, store.entries(_now(), host)).items():
+    for path, why in unused_certificates(loaded, store.entries(now_utc(), host)).items():
         warn(f"{path} {why}")
     here, file = store.known_host(), profile_file(profile)
     routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
@@ -323,8 +321,8 @@ def show(
     """Show every certificate here: owner, validity, faults. Exits with 1 on a fault."""
     loaded = load_profile(profile)
     security = loaded.session.security
-    store, now = _store(folder, security), _now()
-    entries = store.entries(now)
+    store, now = _store(folder, security), now_utc()
+    entries, robots = store.entries(now), store.names().robots
     if security is not None and folder is None:
         why = unused_certificates(loaded, entries)
         entries = [
@@ -337,6 +335,9 @@ def show(
         print_certificates(entries, now)
         if (host := store.known_host()) is not None:
             console().print(f"this computer is {host}")
+    if (robot := loaded.robot.name) in robots:
+        what = "retired" if robots[robot] is None else f"renamed to {robots[robot]}"
+        warn(f"robot {robot} was {what}: routers of this lab deny its keys")
     if not entries:
         fail(f"{store.folder} has no certificates; `vla-zenoh secure init` makes them")
     if any(entry.faults for entry in entries):
@@ -385,7 +386,7 @@ def _print_here(host: str | None, target: RobotTarget) -> None:
     out.print(f"To watch, here: {target.typed('status')}", soft_wrap=True)
 
 
-def _now() -> dt.datetime:
+def now_utc() -> dt.datetime:
     return dt.datetime.now(dt.UTC)
 
 

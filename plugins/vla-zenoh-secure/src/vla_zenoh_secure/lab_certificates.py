@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import datetime as dt
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
+
+import msgspec
 
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.lab.durable import write_whole, writing
 from vla_zenoh.security.certificates import CheckedStore, read, read_file
+from vla_zenoh.security.names import NAMES, Names, read_names
 from vla_zenoh.security.roles import Identity, Role
 from vla_zenoh.security.store import AUTHORITY, THIS_HOST, Files, open_to_others
 from vla_zenoh_secure import authority as ca
@@ -53,19 +57,72 @@ class LabCertificates(CheckedStore):
         if not renew:
             for identity in identities:
                 self._refuse_to_overwrite(self.files(identity.host, identity.node))
-        authority, pairs = self._authority(), list[KeyPair]()
+        authority, names, pairs = self._authority(), self.names(), list[KeyPair]()
         for identity in identities:
             served = identity.addresses or None
             if identity.role is Role.ROUTER:
                 served = (*routers, *self._served(identity))
-            pairs.append(
-                ca.issue(authority, identity.common_name, now, days=days, addresses=served)
-            )
+            name = names.current(identity.common_name)
+            pairs.append(ca.issue(authority, name, now, days=days, addresses=served))
         made: list[Path] = []
         for identity, pair in zip(identities, pairs, strict=True):
             made.append(self._keep(identity.host, identity.node, pair))
             _write(self.files(identity.host, "").authority, authority.certificate, 0o644)
+            _write_names(self.folder / identity.host, names)
         return made
+
+    def names(self) -> Names:
+        """Names that changed since the lab was made.
+
+        Raises:
+            SecurityError: the file cannot be read.
+        """
+        return read_names(self.folder)
+
+    def change(self, names: Names) -> None:
+        """Note that names changed, in the folder of each host, of which routers read theirs.
+
+        Raises:
+            SecurityError: this is not the authority's computer, or a file cannot be written.
+        """
+        self._authority()
+        for folder in (self.folder, *(self.folder / host for host in self.hosts())):
+            _write_names(folder, names)
+
+    def revoke(
+        self,
+        host: str,
+        identities: Iterable[Identity],
+        now: dt.datetime,
+        *,
+        days: int = ca.CERTIFICATE_DAYS,
+        addresses: Iterable[str] = (),
+    ) -> list[Path]:
+        """Give `host` a new name, and `identities` there certificates of it; returns their files.
+
+        Those that are not among `identities` are deleted.
+
+        Raises:
+            SecurityError: as of `add` and `change`.
+        """
+        identities = list(identities)
+        self.change(next_generation(self.names(), host))
+        kept = {AUTHORITY, *(identity.node for identity in identities)}
+        for path in [*self.files(host, "").key.parent.iterdir()]:
+            if path.suffix in (".pem", ".key") and path.stem not in kept:
+                path.unlink()
+        return self.add(identities, now, days=days, addresses=addresses, renew=True)
+
+    def retire(self, host: str) -> None:
+        """Deny the name of `host` for good, and delete its certificates here.
+
+        Raises:
+            SecurityError: as of `change`.
+        """
+        self.change(next_generation(self.names(), host))
+        if host in self.hosts():
+            with writing(self.folder / host, SecurityError):
+                shutil.rmtree(self.folder / host)
 
     def _authority(self) -> KeyPair:
         certificate, key = (self.folder / f"{AUTHORITY}.{end}" for end in ("pem", "key"))
@@ -110,6 +167,25 @@ class LabCertificates(CheckedStore):
         path = self.folder / THIS_HOST
         _write(path, f"{host}\n".encode(), 0o644)
         return path
+
+
+def next_generation(names: Names, host: str) -> Names:
+    """The names after that of `host` was given up for its next one."""
+    number = names.generations.get(host, 1) + 1
+    return Names(names.revision + 1, names.generations | {host: number}, names.robots)
+
+
+def renamed(names: Names, robot: str, new: str | None) -> Names:
+    """The names after `robot` was called `new`, or was retired (None)."""
+    robots = {name: new if now == robot else now for name, now in names.robots.items()}
+    robots[robot] = new
+    robots.pop(new or "", None)
+    return Names(names.revision + 1, names.generations, robots)
+
+
+def _write_names(folder: Path, names: Names) -> None:
+    if names.revision:
+        _write(folder / NAMES, msgspec.json.format(msgspec.json.encode(names)) + b"\n", 0o644)
 
 
 def _write(path: Path, content: bytes, mode: int) -> None:

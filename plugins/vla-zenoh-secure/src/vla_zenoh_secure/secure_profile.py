@@ -117,6 +117,36 @@ def with_operator(text: str, host: str, role: Role) -> str:
     return "".join([*lines[:at], f"{PEOPLE}\n", entry, *rest])
 
 
+def without_operator(text: str, host: str) -> str:
+    """The text of a profile without the people at `host`, as `with_operator` wrote them."""
+    lines = text.splitlines(keepends=True)
+    at = next((n for n, line in enumerate(lines) if line.rstrip() == PEOPLE), len(lines))
+    rest = [line for line in lines[at + 1 :] if not line.startswith(f"      {host}:")]
+    if at < len(lines) and not (rest and rest[0].startswith(" " * 6)):
+        lines[at] = f"{PEOPLE} {{}}\n"
+    return "".join([*lines[: at + 1], *rest])
+
+
+def with_robot_name(text: str, name: str) -> str:
+    """The text of a profile whose robot is called `name`; comments stay.
+
+    Raises:
+        SecurityError: its section ``robot`` has another form than one key a line.
+    """
+    lines, entry = text.splitlines(keepends=True), f"  name: {name}\n"
+    at = next((n for n, line in enumerate(lines) if line.startswith("robot:")), None)
+    if at is None:
+        return f"{text.rstrip()}\nrobot:\n{entry}"
+    if lines[at].partition("#")[0].strip() != "robot:":
+        raise SecurityError(f"has its section robot in one line. Write by hand:\nrobot:\n{entry}")
+    own = at + 1
+    while own < len(lines) and lines[own].startswith((" ", "#", "\n")):
+        if lines[own].startswith("  name:"):
+            return "".join([*lines[:own], entry, *lines[own + 1 :]])
+        own += 1
+    return "".join([*lines[: at + 1], entry, *lines[at + 1 :]])
+
+
 def _host(host: HostProfile, secure: Callable[[Sequence[str]], list[str]]) -> dict[str, Any]:
     out = host.model_dump(mode="json", exclude_none=True)
     return out | {name: secure(out[name]) for name in ("connect", "listen", "link") if name in out}

@@ -42,11 +42,40 @@ class People:
 
     Args:
         most: highest role: that of the certificate with which the page is on the bus.
+        file: where `people` were read, and are read again when it changes.
     """
 
-    def __init__(self, people: Iterable[Person], most: PageRole = "operator") -> None:
+    def __init__(
+        self, people: Iterable[Person], most: PageRole = "operator", file: Path | None = None
+    ) -> None:
         self._most: PageRole = most
-        self._people = [(_digest(one.token), self._bounded(one)) for one in people]
+        self._file, self._version = file, _version(file)
+        self._named = self._digested(people)
+        self._invited: list[tuple[bytes, Person]] = []
+
+    def _digested(self, people: Iterable[Person]) -> list[tuple[bytes, Person]]:
+        return [(_digest(one.token), self._bounded(one)) for one in people]
+
+    @property
+    def _people(self) -> list[tuple[bytes, Person]]:
+        return [*self._named, *self._invited]
+
+    def reread(self) -> bool:
+        """Read the file again; whether it had changed.
+
+        Raises:
+            SecurityError: it is none of people any more; those that it had stay.
+        """
+        version = _version(self._file)
+        if self._file is None or version == self._version:
+            return False
+        self._version = version
+        self._named = self._digested(read_people(self._file))
+        return True
+
+    def has(self, person: Person) -> bool:
+        """Whether this person, with this token and role, is one of them still."""
+        return any(known == person for _, known in self._people)
 
     def _bounded(self, person: Person) -> Person:
         return person if self._most == "operator" else person._replace(role=self._most)
@@ -65,7 +94,7 @@ class People:
             raise SecurityError(f"there is a {name} already: choose another name")
         if len(self._people) >= MAX_PEOPLE:
             raise SecurityError(f"{MAX_PEOPLE} people have a token: restart the server")
-        self._people.append((_digest(token), person))
+        self._invited.append((_digest(token), person))
         return person
 
     def find(self, token: str) -> Person | None:
@@ -75,6 +104,17 @@ class People:
             if hmac.compare_digest(digest, given):
                 found = person
         return found
+
+
+def _version(file: Path | None) -> tuple[int, int, int] | None:
+    """Differs after a change of the file; None: there is none."""
+    if file is None:
+        return None
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_ino, found.st_size
 
 
 def _digest(token: str) -> bytes:

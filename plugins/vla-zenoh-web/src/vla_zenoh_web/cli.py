@@ -37,8 +37,8 @@ def web(
         Path | None,
         typer.Option(
             "--people",
-            help="YAML file of people: NAME: {role: operator|viewer, token: ...}. "
-            "Default: one operator, whose token is printed.",
+            help="YAML file of people: NAME: {role: operator|viewer, token: ...}; who is taken out "
+            "of it is out at once. Default: one operator, whose token is printed.",
         ),
     ] = None,
     certificate: Annotated[
@@ -86,7 +86,7 @@ def web(
         errors().print(f"page of robot {profile.robot.name}: {url}", soft_wrap=True)
         # No person on the page has more rights than the certificate here.
         most = "viewer" if local_role(profile) is Role.VIEWER else "operator"
-        serve_page(profile, session, People(found, most), listening, names, tls, stop)
+        serve_page(profile, session, People(found, most, people), listening, names, tls, stop)
 
     with listening:
         run_node(profile, run, identity=None)

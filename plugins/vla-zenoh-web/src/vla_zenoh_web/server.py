@@ -25,7 +25,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from vla_zenoh_teleop.policy import OperatorInput
 
-from vla_zenoh.errors import CodecError, VlaZenohError
+from vla_zenoh.errors import CodecError, SecurityError, VlaZenohError
 from vla_zenoh.lab.rate_limit import RateLimit
 from vla_zenoh.types import Event
 from vla_zenoh_web import metrics, requests
@@ -44,7 +44,7 @@ FILES = {
 }
 GONE = (WebSocketDisconnect, RuntimeError)
 """How the end of a browser shows; RuntimeError: Starlette, sent after the end."""
-STATE_S, NODES_S = 0.05, 1.0
+STATE_S, NODES_S, PEOPLE_S = 0.05, 1.0, 1.0
 ENTER_S, DENIED_S = 5.0, 0.5
 """A wrong token is answered this late."""
 STOP_AGAIN_S = 0.1
@@ -57,14 +57,15 @@ PICTURE_POLL_S = 0.01
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
 NOT_HERE = (requests.EnterRequest, requests.LookRequest, requests.DrawnRequest)
 """The first request of a socket, and those of the socket for images."""
+SHOWN_OUT = "you are no longer among the people of this page, or your role has changed"
 OPERATORS_ONLY = "your token is a viewer's, which may look and nothing else"
 
 
 class Page:
     """One open page: what waits to be sent to it."""
 
-    def __init__(self, number: int, person: Person) -> None:
-        self.number, self.person = number, person
+    def __init__(self, number: int, person: Person, socket: WebSocket) -> None:
+        self.number, self.person, self.socket = number, person, socket
         self.limit = RateLimit(RATE_HZ, BURST, time.monotonic())
         self.complaints = RateLimit(5.0, 10.0, time.monotonic())
         self.answers: deque[str] = deque(maxlen=MAX_ANSWERS)
@@ -89,7 +90,8 @@ class PageServer:
         self._pages: dict[int, Page] = {}
         self._news: deque[dict[str, Any]] = deque(maxlen=MAX_NEWS)
         self._state = ""
-        self._next = self._looking = 0
+        self._looking: dict[WebSocket, Person] = {}
+        self._next = 0
         self.counters: Counter[str] = link.counters
         # Stops have threads of their own: those of other requests may all be waiting.
         self._stops = ThreadPoolExecutor(2, thread_name_prefix="stop")
@@ -175,10 +177,13 @@ class PageServer:
             self._stops.shutdown(wait=False)
 
     async def _watch(self) -> None:
-        nodes_s = 0.0
+        nodes_s, people_s = 0.0, time.monotonic()
         while True:
             now_s = time.monotonic()
             self._link.poll()
+            if now_s - people_s > PEOPLE_S:
+                people_s = now_s
+                self._reread_people()
             for event in self._link.client.pop_events():
                 news = noted_event(*event)
                 self._news.append(news)
@@ -193,6 +198,24 @@ class PageServer:
                 for page in self._pages.values():
                     page.changed.set()
             await asyncio.sleep(max(0.0, now_s + STATE_S - time.monotonic()))
+
+    def _reread_people(self) -> None:
+        """Show out who is no longer in the file; their hold ends, and the arm brakes."""
+        try:
+            if not self._people.reread():
+                return
+        except SecurityError as error:
+            why = f"{error}. Who was in it before still may"
+            self._link.client.note("web", Event("warning", "notice", "people", why))
+            return
+        for page in self._pages.values():
+            if not self._people.has(page.person):
+                self._link.release(page.number, gone=True)
+                page.person = page.person._replace(role="viewer")  # whatever is on its way
+                self._begin(_show_out(page.socket))
+        for socket, person in self._looking.items():
+            if not self._people.has(person):
+                self._begin(_show_out(socket))
 
     def _here(self) -> list[dict[str, Any]]:
         """Who has a page open, by name, and who of them holds the arm."""
@@ -243,7 +266,7 @@ class PageServer:
             if person is None:
                 return
             self._next += 1
-            page = self._pages[self._next] = Page(self._next, person)
+            page = self._pages[self._next] = Page(self._next, person, socket)
             sending = asyncio.create_task(self._send_state(page, socket))
             try:
                 self._welcome(page)
@@ -414,9 +437,10 @@ class PageServer:
     async def _show_pictures(self, socket: WebSocket) -> None:
         with contextlib.suppress(*GONE):
             # As `security.roles`: pictures show people.
-            if await self._enter(socket, lambda: self._looking, viewers=False) is None:
+            person = await self._enter(socket, lambda: len(self._looking), viewers=False)
+            if person is None:
                 return
-            self._looking += 1
+            self._looking[socket] = person
             look = PageView(time.monotonic())
             sending = asyncio.create_task(self._send_pictures(look, socket))
             try:
@@ -424,7 +448,7 @@ class PageServer:
                     if fault := look.read(await _receive(socket), self._pictures, time.monotonic()):
                         self.counters[fault] += 1
             finally:
-                self._looking -= 1
+                del self._looking[socket]
                 sending.cancel()
                 self._pictures.change(look.streams, ())
 
@@ -447,6 +471,12 @@ class PageServer:
                     self.counters["picture_bytes"] += len(picture.jpeg)
                     await socket.send_bytes(json.dumps(head).encode() + b"\n" + picture.jpeg)
                 await asyncio.sleep(PICTURE_POLL_S)
+
+
+async def _show_out(socket: WebSocket) -> None:
+    with contextlib.suppress(*GONE):
+        await socket.send_text(json.dumps({"is": "denied", "why": SHOWN_OUT}))
+        await socket.close(POLICY_VIOLATION)
 
 
 async def _receive(socket: WebSocket) -> str:

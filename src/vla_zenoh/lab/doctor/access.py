@@ -86,7 +86,8 @@ def _refusal(profile: Profile, node: str | None) -> str:
                 return ""
     return (
         "the router accepts the certificate but grants it no access: its rules lack this name. "
-        "Restart the router with this profile, or check that any node is up"
+        "Restart the router with this profile, copy the new certificates of this host if it was "
+        "revoked, or check that any node is up"
     )
 
 
