@@ -54,10 +54,18 @@ OF_TROSSEN = (
     "trossen-arm-sim==0.2.3",
     "websockets==17.4",
 )
+STRANDS = "STRANDS_PYTHON"
+"""Environment variable with the Python that has strands-robots, which needs 3.12."""
+OF_STRANDS = ("strands-robots[mesh]==0.5.3",)
 
 
 def environment(
-    uv: str, environ: dict[str, str], name: str, alone: tuple[str, ...], needed: tuple[str, ...]
+    uv: str,
+    environ: dict[str, str],
+    name: str,
+    alone: tuple[str, ...],
+    needed: tuple[str, ...],
+    base: str = sys.executable,
 ) -> str:
     """Make an environment unless it is there; its Python.
 
@@ -67,13 +75,14 @@ def environment(
         name: of the folder.
         alone: packages without what they need.
         needed: packages with that.
+        base: Python, or its version.
     """
     folder = TOOLS / "rivals" / name
     python, ready = folder / "bin" / "python", folder / "ready"
     told = "\n".join((*alone, *needed))
     if not ready.is_file() or ready.read_text() != told:
         install = [uv, "--quiet", "pip", "install", "--python", str(python)]
-        venv = [uv, "--quiet", "venv", "--clear", "--python", sys.executable, str(folder)]
+        venv = [uv, "--quiet", "venv", "--clear", "--python", base, str(folder)]
         subprocess.run(venv, env=environ, check=True)
         if alone:
             subprocess.run([*install, "--no-deps", *alone], env=environ, check=True)
@@ -105,6 +114,8 @@ def main() -> int:
         environ[TROSSEN] = environment(uv, environ, "trossen", (), OF_TROSSEN)
     paths = library(uv, environ, TROSSEN_ARM), environ.get("PYTHONPATH", "")
     environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+    if STRANDS not in environ:
+        environ[STRANDS] = environment(uv, environ, "strands", (), OF_STRANDS, base="3.12")
     if SIMULATOR not in environ:
         environ[SIMULATOR] = simulator_environment(uv, environ, *PACKAGES)
     command = [sys.executable, "-m", "pytest", "-m", "rivals", "tests/rivals", *sys.argv[1:]]

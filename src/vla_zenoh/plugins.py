@@ -202,6 +202,7 @@ PACKAGES: Mapping[str, str] = {
     "serve.mcp": "vla-zenoh-mcp",
     "serve.policy": "vla-zenoh-serve",
     "serve.r2c": "vla-zenoh-r2c",
+    "serve.strands": "vla-zenoh-strands",
     "teleop": "vla-zenoh-teleop",
     "trial": "vla-zenoh-trial",
     "view": "vla-zenoh-view",

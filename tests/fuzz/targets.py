@@ -32,6 +32,7 @@ from vla_zenoh_ros2.bridge_view import read_view
 from vla_zenoh_ros2.keys import Attachment
 from vla_zenoh_ros2.pictures import COMPRESSED_IMAGE, IMAGE
 from vla_zenoh_serve import openpi_server
+from vla_zenoh_strands import wire as strands
 
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options
@@ -484,6 +485,12 @@ def _targets() -> Iterator[Target]:
         lambda: [r2c_peer.observation([0.1] * 6)],
     )
     yield Target("r2c-actions", r2c.decode_actions, codec, lambda: [r2c_peer.actions([[0.1] * 6])])
+    yield Target(
+        "strands-command",
+        strands.decode_command,
+        codec,
+        lambda: [b'{"sender_id": "boss", "turn_id": "1", "command": {"action": "stop"}}'],
+    )
     # -- ROS 2
     yield Target(
         "ros2-attachment", Attachment.decode, codec, lambda: [bytes(16) + b"\x10" + bytes(16)]

@@ -8,12 +8,14 @@ import franka_node_rig
 import physicalai_rig
 import pytest
 import r2c_rig
+import strands_rig
 import trossen_rig
 
 NEEDS = {
     "test_physicalai": physicalai_rig.VARIABLE,
     "test_franka_node": franka_node_rig.VARIABLE,
     "test_r2c": r2c_rig.VARIABLE,
+    "test_strands": strands_rig.VARIABLE,
     "test_trossen": trossen_rig.VARIABLE,
 }
 """Beginning of a file's name -> environment variable."""

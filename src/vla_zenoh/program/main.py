@@ -83,7 +83,7 @@ COMMANDS: Panels = {
         "web": OF_A_PACKAGE,
         "serve": CommandGroup(
             "Offer a model to clients of other frameworks.",
-            dict.fromkeys(("policy", "mcp", "r2c"), OF_A_PACKAGE),
+            dict.fromkeys(("policy", "mcp", "r2c", "strands"), OF_A_PACKAGE),
         ),
     },
     "Watch and record": {

@@ -1,0 +1,1 @@
+"""An arm of ours as a peer of the strands-robots mesh."""
