@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "opencv-python-headless", "pin>=4", "example-robot-data>=6"]
+# dependencies = ["numpy", "opencv-python-headless", "pin>=4"]
 # ///
 """Lifts a bar with both arms of ``two_pandas_sim``, in joints and without any learning.
 

@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "opencv-python-headless", "pin>=4", "example-robot-data>=6"]
+# dependencies = ["numpy", "opencv-python-headless", "pin>=4"]
 # ///
 """Puts a brick in the box with an SO-101, in joints and without any learning: for ``so101_sim``.
 

@@ -37,7 +37,8 @@ OLDEST_PYTHON = (3, 11)
 OLDEST_UV = (0, 8)
 
 EVERYTHING = "all,dev"
-SIZES_GB = {EVERYTHING: 2.7, "brick,sim": 1.4}
+DEMO = "brick,sim"
+SIZES_GB = {EVERYTHING: 2.7, DEMO: 0.8}
 
 OPENMP = "libgomp.so.1"
 """Pinocchio needs it and no wheel of ours brings it; a bare Debian has no package that does."""
@@ -130,6 +131,12 @@ def loads(library: str) -> bool:
     except OSError:
         return False
     return True
+
+
+def drop_headers(environment: Path) -> None:
+    """Remove C++ headers of Boost and Pinocchio, 200 MB that only a compiler reads."""
+    for packages in (environment / "lib").glob("python*/site-packages"):
+        shutil.rmtree(packages / "cmeel.prefix" / "include", ignore_errors=True)
 
 
 def bring_openmp(uv: Path, python: Path) -> None:
@@ -228,6 +235,8 @@ def main() -> None:
     editable = [word for package in packages for word in ("--editable", package)]
     run(uv, *quiet, "pip", "install", *target, *editable)
     bring_openmp(uv, VENV / "bin" / "python")
+    if extras == DEMO:
+        drop_headers(VENV)
     say("done; the command is .venv/bin/vla-zenoh")
 
 

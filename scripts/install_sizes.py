@@ -1,8 +1,8 @@
 """Sizes of an install, by what it is for: ``python scripts/install_sizes.py [WORD ...]``.
 
 Each row is installed into an empty environment by uv, with the versions of constraints.txt, and
-asked for its version; with words only the rows that have one of them. A model with packages of its
-own adds its own environment.
+asked for its version; with words only the rows that have one of them. That of the demo loses its
+C++ headers, as in `make demo`. A model with packages of its own adds its own environment.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from bootstrap import CONSTRAINTS, ROOT, uv_environment
+from bootstrap import CONSTRAINTS, DEMO, ROOT, drop_headers, uv_environment
 
 UV = Path(sys.executable).parent / "uv"
 ROWS = {
@@ -22,7 +22,7 @@ ROWS = {
     "model host, shipped policy": ("brick,secure",),
     "robot host": ("control,record,secure",),
     "robot host, ROS 2": ("record,secure", "vla-zenoh-ros2"),
-    "the demo, as `make demo` has it": ("brick,sim",),
+    "the demo, as `make demo` has it": (DEMO,),
     "simulator and everything in the tutorial": ("all",),
     "the same with the viewer": ("all", "vla-zenoh-view"),
 }
@@ -50,6 +50,8 @@ def measure(extras: str, packages: Sequence[str], folder: Path) -> tuple[float, 
         subprocess.run(
             [str(word) for word in command], check=True, env=environ, stdout=subprocess.DEVNULL
         )
+    if extras == DEMO:
+        drop_headers(folder)
     packages = next((folder / "lib").glob("python*")) / "site-packages"
     sizes = sorted(((size_mb(p), p.name) for p in packages.iterdir() if p.is_dir()), reverse=True)
     largest = ", ".join(f"{name} {size:.0f}" for size, name in sizes[:LARGEST])

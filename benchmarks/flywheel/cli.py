@@ -39,7 +39,6 @@ REQUIREMENTS = (
     "metaworld==3.1.1",
     "packaging",
     "pin>=4",
-    "example-robot-data>=6",
     "mcap>=1.2",
     "rosbags>=0.11",
     "ruckig>=0.15",

@@ -1,7 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
 # dependencies = [
-#     "example-robot-data>=6",
 #     "numpy",
 #     "pin>=4",
 #     "pyzmq>=26",

@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["example-robot-data>=6", "numpy", "pin>=4", "vla-zenoh-policy-servers"]
+# dependencies = ["numpy", "pin>=4", "vla-zenoh-policy-servers"]
 # ///
 """Queries the REST server of OpenVLA or OpenVLA-OFT: ``POST /act``.
 

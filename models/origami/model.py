@@ -2,7 +2,6 @@
 # requires-python = ">=3.11"
 # dependencies = [
 #     "eclipse-zenoh>=1.9,<2",
-#     "example-robot-data>=6",
 #     "numpy",
 #     "pin>=4",
 #     "vla-zenoh-policy-servers",

@@ -21,6 +21,9 @@ PLUGINS = {"models": plugins.MODELS, BENCHMARKS: plugins.BENCHMARKS}
 """What packages bring, and no folder of this one is searched for."""
 SEARCH_PATH_VARIABLE = "VLA_ZENOH_PATH"
 ROBOT_DATA_PREFIX = "example-robot-data:"
+SHIPPED_PREFIX = "shipped:"
+PACKAGED = (ROBOT_DATA_PREFIX, SHIPPED_PREFIX)
+"""How a robot description begins that is not a path."""
 
 
 def shipped(kind: str) -> Path:
@@ -130,10 +133,12 @@ def extended_profile(path: Path, parent: str) -> Path:
 
 
 def robot_urdf(description: str) -> Path:
-    """The URDF a profile names: a path, or ``example-robot-data:<path below robots/>``.
+    """The URDF a profile names: a path, ``shipped:`` or ``example-robot-data:`` and one in there.
 
     A `ResourceError` without that file, a `MissingExtraError` without the package.
     """
+    if description.startswith(SHIPPED_PREFIX):
+        description = str(shipped("profiles") / description.removeprefix(SHIPPED_PREFIX))
     if not description.startswith(ROBOT_DATA_PREFIX):
         path = Path(description).expanduser()
         if not path.is_file():
@@ -144,10 +149,10 @@ def robot_urdf(description: str) -> Path:
     try:
         package = importlib.metadata.distribution("example-robot-data")
     except importlib.metadata.PackageNotFoundError as error:
-        raise MissingExtraError("example-robot-data", "control") from error
+        raise MissingExtraError("example-robot-data", "meshes") from error
     root = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
     if not root.is_dir():
-        raise MissingExtraError("example-robot-data", "control")
+        raise MissingExtraError("example-robot-data", "meshes")
     path = root / description.removeprefix(ROBOT_DATA_PREFIX)
     if not path.is_file():
         raise ResourceError(

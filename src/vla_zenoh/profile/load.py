@@ -17,7 +17,7 @@ from vla_zenoh.errors import PluginError, ProfileError
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.schema import names_file
 from vla_zenoh.profile.section import WITH_REMOVABLE, Lines, Place, Section, explain, merge
-from vla_zenoh.resources import ROBOT_DATA_PREFIX, extended_profile, is_path, profile_file
+from vla_zenoh.resources import PACKAGED, extended_profile, is_path, profile_file
 from vla_zenoh.types import shown
 
 MAX_EXTENDS = 8
@@ -182,8 +182,8 @@ def is_relative(text: str) -> bool:
 
 
 PATHS: Mapping[str, Callable[[str], bool]] = {
-    "robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
-    "parts.*.robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
+    "robot.description": lambda text: not text.startswith(PACKAGED),
+    "parts.*.robot.description": lambda text: not text.startswith(PACKAGED),
     "cameras.*.source": names_file,
     "cameras.*.intrinsics": lambda text: True,
     "cameras.*.check.reference": lambda text: True,

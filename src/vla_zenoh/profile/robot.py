@@ -94,7 +94,9 @@ class RobotProfile(Section):
             The node of ``sim`` and ``ros2`` has their name, that of all others is ``arm``.
         command: set-points of the arm: ``pose`` of the TCP, for a Cartesian impedance controller,
             or ``joint`` positions.
-        description: path of the URDF, or ``example-robot-data:`` and a path in that package.
+        description: path of the URDF; ``shipped:`` and the name of one that comes with the package
+            (panda.urdf, so101.urdf); ``example-robot-data:`` and a path in that package, of the
+            extra ``meshes``.
         base_frame: link in which all poses are expressed.
         tcp_frame: link whose pose is controlled.
         arm_joints: in the order of every list of joint values in the profile.

@@ -73,7 +73,7 @@ class RobotModel:
     open.
     """
 
-    description: str = "example-robot-data:panda_description/urdf/panda.urdf"
+    description: str = "shipped:panda.urdf"
     robot: RobotProfile | None = None  # None: the Panda or the SO-101
     mesh_grid_m: float | None = None
     arm_joints: tuple[str, ...] = tuple(f"panda_joint{i}" for i in range(1, 8))  # base to tip
@@ -102,7 +102,7 @@ class RobotModel:
 
 
 SO101 = RobotModel(
-    description="example-robot-data:so_arm_description/urdf/so101.urdf",
+    description="shipped:so101.urdf",
     mesh_grid_m=0.002,
     arm_joints=("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"),
     # The motors are geared 345 : 1; the URDF has neither their inertia nor their stall torque.
@@ -130,6 +130,12 @@ SO101 = RobotModel(
     colour=(0.90, 0.90, 0.88, 1.0),
 )
 
+WITH_MESHES = {
+    "example-robot-data:panda_description/urdf/panda.urdf": RobotModel().description,
+    "example-robot-data:so_arm_description/urdf/so101.urdf": SO101.description,
+}
+"""The same arms as they look, of the extra ``meshes``: their description, and that of ours."""
+
 
 def robot_model(robot: RobotProfile) -> RobotModel:
     """The robot of a profile.
@@ -139,7 +145,8 @@ def robot_model(robot: RobotProfile) -> RobotModel:
             missing or does not fit.
     """
     shipped = {model.description: model for model in (RobotModel(), SO101)}
-    found = shipped.get(robot.description) or _any_arm(robot)
+    described = WITH_MESHES.get(robot.description, robot.description)
+    found = shipped.get(described) or _any_arm(robot)
     return replace(
         found,
         description=robot.description,

@@ -179,12 +179,11 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
 
 
 def _shipped_spec(robot: RobotModel) -> mujoco.MjSpec:
-    """With the meshes as they are, or coarse."""
+    """Of shapes, or with the meshes as they are, or coarse."""
     urdf = resources.robot_urdf(robot.description)
     spec = mujoco.MjSpec.from_file(str(urdf))
-    meshes = resources.meshes_of(urdf)
     for mesh in spec.meshes:
-        file = meshes / Path(mesh.file).name
+        file = resources.meshes_of(urdf) / Path(mesh.file).name
         if robot.mesh_grid_m is None:
             mesh.file = str(file)
         else:

@@ -142,8 +142,8 @@ def test_a_robot_that_is_not_here_is_a_fault_where_the_command_node_runs_and_els
 ) -> None:
     urdf, told = own_folder / "arm.urdf", "is not a file"
     if what == "meshes":
-        shipped = load_profile("panda_sim").robot.description
-        urdf.write_text(robot_urdf(shipped).read_text())  # its meshes are not below this folder
+        other = robot_urdf("example-robot-data:panda_description/urdf/panda.urdf")
+        urdf.write_text(other.read_text())  # its meshes are not below this folder
         told = "package://NAME/... is looked for as NAME/... beside the URDF"
     (own_folder / "lab.yaml").write_text(TWO_HOSTS.format(urdf=urdf))
     for words, code in (([], 0), (["--host", "gpu"], 0), (["--host", "desk"], 1)):

@@ -52,7 +52,8 @@ from vla_zenoh.types import (
     Task,
 )
 
-PROFILE = load_profile("panda_sim")
+WITH_MESHES = "example-robot-data:panda_description/urdf/panda.urdf"
+PROFILE = override(load_profile("panda_sim"), {"robot": {"description": WITH_MESHES}})
 BARE = override(PROFILE, {"robot": {"description": "/nowhere/arm.urdf"}})
 KEYS = PROFILE.keys
 ZERO_NS = 1_700_000_000_000_000_000

@@ -73,4 +73,4 @@ def test_a_model_that_is_inherited_can_be_taken_away(tmp_path: Path) -> None:
 
 
 def test_the_robots_of_the_package_stay_what_they_are() -> None:
-    assert load_profile("panda_sim").robot.description.startswith("example-robot-data:")
+    assert load_profile("panda_sim").robot.description == "shipped:panda.urdf"

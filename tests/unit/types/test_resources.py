@@ -127,9 +127,16 @@ def test_robots_are_found_in_whichever_layer_of_an_environment_their_package_is(
     assert resources.robot_urdf("example-robot-data:arm/arm.urdf") == urdf
 
 
+def test_a_description_that_comes_with_the_package_needs_no_other() -> None:
+    urdf = resources.robot_urdf("shipped:panda.urdf")
+    assert urdf == resources.shipped("profiles") / "panda.urdf"
+    with pytest.raises(ResourceError, match="is not a file"):
+        resources.robot_urdf("shipped:absent.urdf")
+
+
 def test_without_the_collection_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [])
-    with pytest.raises(MissingExtraError, match=r"pip install .* '\.\[control\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install .* '\.\[meshes\]'"):
         resources.robot_urdf(PANDA)
 
 

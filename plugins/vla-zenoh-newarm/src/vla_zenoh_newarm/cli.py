@@ -18,7 +18,7 @@ from vla_zenoh.errors import OutputError, VlaZenohError
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.profile.check import check_profile
-from vla_zenoh.resources import ROBOT_DATA_PREFIX, robot_urdf
+from vla_zenoh.resources import PACKAGED, robot_urdf
 from vla_zenoh_newarm.answers import Answers
 from vla_zenoh_newarm.arm import Arm, found_arm, meshes_of
 from vla_zenoh_newarm.profile_text import profile_text
@@ -117,7 +117,7 @@ def _name(file: Path) -> str:
 
 
 def _is_named(description: str) -> bool:
-    return description.startswith(ROBOT_DATA_PREFIX)
+    return description.startswith(PACKAGED)
 
 
 def _report(file: Path, arm: Arm, as_json: bool) -> None:

@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "eclipse-zenoh", "example-robot-data>=6", "protobuf>=5"]
+# dependencies = ["numpy", "eclipse-zenoh", "protobuf>=5"]
 # ///
 """A policy that answers over Huawei's R2C as a worker: our arm is a robot of its own.
 
