@@ -39,16 +39,18 @@ class Controller(TrossenProcess):
         return np.array(self.ask(since=time.monotonic() - 0.1)["rows"][-1][1])
 
     def stood(self, since_s: float) -> tuple[float, float]:
-        """After which time from `since_s` on the arm stands, and how far joint_0 went on."""
+        """After which time from `since_s` on the arm stands, and how far a joint went on."""
         end_s = time.monotonic() + LATEST_S
         while time.monotonic() < end_s:
             time.sleep(0.2)
             rows = self.ask(since=since_s)["rows"]
-            last_rad = rows[-1][1][0]
-            moving = [at_s for at_s, at in rows if abs(at[0] - last_rad) > STANDS_RAD]
-            stands_s = moving[-1] if moving else rows[0][0]
-            if rows[-1][0] - stands_s > STANDS_S:
-                return stands_s - since_s, abs(last_rad - rows[0][1][0])
+            times_s = np.array([at_s for at_s, _ in rows])
+            joints_rad = np.array([joints for _, joints in rows])[:, :6]
+            apart_rad = np.abs(joints_rad - joints_rad[-1]).max(axis=1)
+            moving = np.flatnonzero(apart_rad > STANDS_RAD)
+            stands_s = times_s[moving[-1]] if len(moving) else times_s[0]
+            if times_s[-1] - stands_s > STANDS_S:
+                return float(stands_s - since_s), float(apart_rad[0])
         raise AssertionError("it went on and on")
 
 
