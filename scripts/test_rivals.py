@@ -57,6 +57,15 @@ OF_TROSSEN = (
 STRANDS = "STRANDS_PYTHON"
 """Environment variable with the Python that has strands-robots, which needs 3.12."""
 OF_STRANDS = ("strands-robots[mesh]==0.5.3",)
+INSPECT = "INSPECT_PYTHON"
+"""Environment variable with the Python that has Inspect Robots, and us as its embodiment."""
+OURS = ("vla-zenoh-policy-servers", "vla-zenoh-primitives", "vla-zenoh-inspect")
+OF_INSPECT = (
+    "inspect-robots==0.60.0",
+    "inspect-robots-agent==0.28.0",
+    *("-c", str(ROOT / "constraints.txt"), "-e", f"{ROOT}[control]"),
+    *(word for name in OURS for word in ("-e", str(ROOT / "plugins" / name))),
+)
 
 
 def environment(
@@ -116,6 +125,8 @@ def main() -> int:
     environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     if STRANDS not in environ:
         environ[STRANDS] = environment(uv, environ, "strands", (), OF_STRANDS, base="3.12")
+    if INSPECT not in environ:
+        environ[INSPECT] = environment(uv, environ, "inspect", (), OF_INSPECT)
     if SIMULATOR not in environ:
         environ[SIMULATOR] = simulator_environment(uv, environ, *PACKAGES)
     command = [sys.executable, "-m", "pytest", "-m", "rivals", "tests/rivals", *sys.argv[1:]]

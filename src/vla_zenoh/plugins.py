@@ -213,6 +213,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "lerobot_robot_vla_zenoh": ("vla-zenoh-policy-servers",),
     "vla-zenoh-dataset": ("vla-zenoh-policy-servers",),
     "vla-zenoh-figures": ("vla-zenoh-benchmarks",),
+    "vla-zenoh-inspect": ("vla-zenoh-policy-servers", "vla-zenoh-primitives"),
     "vla-zenoh-mcp": ("vla-zenoh-primitives",),
     "vla-zenoh-nights": ("vla-zenoh-trial",),
     "vla-zenoh-serve": ("vla-zenoh-policy-servers",),

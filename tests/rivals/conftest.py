@@ -16,6 +16,7 @@ NEEDS = {
     "test_franka_node": franka_node_rig.VARIABLE,
     "test_r2c": r2c_rig.VARIABLE,
     "test_strands": strands_rig.VARIABLE,
+    "test_inspect": "INSPECT_PYTHON",
     "test_trossen": trossen_rig.VARIABLE,
 }
 """Beginning of a file's name -> environment variable."""

@@ -11,11 +11,11 @@ from lerobot.cameras import Camera, make_cameras_from_configs
 from lerobot.robots import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 from lerobot.utils.errors import DeviceNotConnectedError
+from vla_zenoh_policy_servers.loop_worker import LoopWorker
 
 import vla_zenoh
 from lerobot_robot_vla_zenoh.config import VlaZenohConfig, arm_profile
 from lerobot_robot_vla_zenoh.numbers import ArmNumbers
-from lerobot_robot_vla_zenoh.worker import LoopWorker
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.keys import worker_node

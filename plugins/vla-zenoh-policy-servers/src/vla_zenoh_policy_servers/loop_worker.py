@@ -1,4 +1,4 @@
-"""The worker whose chunks are the actions of a LeRobot loop, one step each."""
+"""The worker whose chunks are the actions of a loop of others, one step each."""
 
 from __future__ import annotations
 
@@ -22,20 +22,26 @@ STAND_S = 0.1
 class LoopWorker:
     """Publishes each action of a loop when it is sent; while there is none the arm stands.
 
-    LeRobot saves an episode between two of its loops: the arm then keeps its last goal, as its own
-    motors do. When the process ends the deadman brakes it.
+    Such a loop pauses, as where it saves an episode: the arm then keeps its last goal, as motors
+    with a controller of their own do. When the process ends the deadman brakes it.
 
     Args:
         session: with the rights of a worker of this name.
         action: what a step means.
+        model: name in its spec.
     """
 
     def __init__(
-        self, profile: Profile, session: zenoh.Session, name: str, action: ActionSpec
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        name: str,
+        action: ActionSpec,
+        model: str = "lerobot",
     ) -> None:
         self.name = name
         self.spec = ModelSpec(
-            name="lerobot",
+            name=model,
             observation=ObservationSpec(
                 cameras=(),
                 state=("joint", "gripper"),
@@ -56,7 +62,7 @@ class LoopWorker:
         self._goal: FloatArray | None = None
         self._sent_s = 0.0
         self._lock, self._end = threading.Lock(), threading.Event()
-        self._thread = threading.Thread(target=self._stand, name="lerobot loop", daemon=True)
+        self._thread = threading.Thread(target=self._stand, name="loop worker", daemon=True)
         self._thread.start()
 
     def infer(self, observation: Observation) -> ActionSteps:
