@@ -222,7 +222,7 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
     told = (detail.get(name) for name in ("busy", "slow", "renderer"))
     text = str(next(filter(None, told), ""))
     if not text and "obeyed" in detail:
-        return f"{mode}: in control" if detail["obeyed"] else "shadow mode"
+        return (f"{mode}: in control" if detail["obeyed"] else "shadow mode") + _gpus(detail)
     certificates = _fields(detail.get("certificates"))
     days, unknown = certificates.get("days"), certificates.get("unknown")
     if not text and isinstance(days, (int, float)):
@@ -230,6 +230,18 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
     if not text and (seen := _fields(detail.get("middleware"))):
         text = f"robot's ROS 2: {', '.join(map(str, seen))}"
     return one_line(text or (unknown if isinstance(unknown, str) else ""), MAX_WORDS)
+
+
+def _gpus(detail: Mapping[str, Any]) -> str:
+    """Load and memory of the GPUs of a worker's host; older workers do not say."""
+    if not isinstance(found := detail.get("gpus"), list):
+        return ""
+    out = ["no GPU"] if not found else []
+    for gpu in map(_fields, found):
+        load, *memory = (gpu.get(name) for name in ("load_percent", "used_bytes", "total_bytes"))
+        gib = (f"{size / 2**30:.1f}" if isinstance(size, int) else "?" for size in memory)
+        out.append(f"GPU {'?' if load is None else load} %, {' of '.join(gib)} GiB")
+    return "".join(f", {text}" for text in out)
 
 
 def complaints(detail: Mapping[str, Any]) -> list[str]:

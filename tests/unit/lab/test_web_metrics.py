@@ -42,6 +42,29 @@ def test_whatever_a_status_holds_it_is_openmetrics(found: list[NodeStatus]) -> N
     assert "vla_zenoh_web_pages" in parsed(exposition([*rows[:1], *rows[1:]], {"a b": 1}, 2))
 
 
+def test_gpus_of_a_workers_host_are_told_apart_and_none_is_a_number() -> None:
+    gpu = {"name": "Card", "used_bytes": 3, "total_bytes": 80, "load_percent": 34}
+    unknown = {**gpu, "load_percent": None}
+    details = {
+        "worker-a": {"gpus": [gpu, unknown], "gpu_own_bytes": 2},
+        "worker-b": {"gpus": [], "gpu_own_bytes": None},
+        "camera": {},
+    }
+    statuses = {
+        name: NodeStatus(name, "ok", "h", 1, 2, detail=detail) for name, detail in details.items()
+    }
+    rows = [row(status, name) for name, status in statuses.items()]
+    found = parsed(exposition(rows, {}, 0))
+    counts = {sample.labels["node"]: sample.value for sample in found["vla_zenoh_gpus"]}
+    assert counts == {"worker-a": 2, "worker-b": 0}
+    used = found["vla_zenoh_gpu_memory_used_bytes"]
+    assert [(sample.labels["gpu"], sample.value) for sample in used] == [("0", 3), ("1", 3)]
+    (load,) = found["vla_zenoh_gpu_load_ratio"]
+    assert (load.labels["gpu"], load.value) == ("0", 0.34)
+    (own,) = found["vla_zenoh_gpu_own_bytes"]
+    assert (own.labels["node"], own.value) == ("worker-a", 2)
+
+
 def test_counters_latencies_and_the_arm_have_base_units() -> None:
     status = NodeStatus(
         "command",

@@ -144,6 +144,7 @@ def _of_node(out: _Families, row: NodeRow) -> None:
             text = "Duration of a stage."
             out.add(gauge, "latency_seconds", text, labels, value_ms / 1e3, "seconds")
     _of_links(out, node, status.detail)
+    _of_gpus(out, node, status.detail)
     if row.name == "command":
         _of_arm(out, status.detail)
 
@@ -172,6 +173,27 @@ def _of_links(out: _Families, node: dict[str, str], detail: Mapping[str, Any]) -
     for key, count in _numbers(net.get("lost")):
         labels = {**node, "key": key}
         out.add(CounterMetricFamily, "lost_records", "Never arrived here.", labels, count)
+
+
+def _of_gpus(out: _Families, node: dict[str, str], detail: Mapping[str, Any]) -> None:
+    gauge, gpus = GaugeMetricFamily, detail.get("gpus")
+    if not isinstance(gpus, list):  # no worker
+        return
+    out.add(gauge, "gpus", "Of the worker's host.", node, len(gpus))
+    for index, gpu in enumerate(gpus):
+        if not isinstance(gpu, Mapping):
+            continue
+        labels = {**node, "gpu": str(index)}
+        load_percent = gpu.get("load_percent")
+        if isinstance(load_percent, (int, float)):
+            text = "Share of time in which a program ran on it."
+            out.add(gauge, "gpu_load_ratio", text, labels, load_percent / 100, "ratio")
+        for name in ("used_bytes", "total_bytes"):
+            text = "Memory of the GPU, of all programs."
+            what = f"gpu_memory_{name}"
+            out.add(gauge, what, text, labels, gpu.get(name), "bytes")
+    text = "Held by PyTorch in the worker."
+    out.add(gauge, "gpu_own_bytes", text, node, detail.get("gpu_own_bytes"), "bytes")
 
 
 def _of_arm(out: _Families, detail: Mapping[str, Any]) -> None:

@@ -25,6 +25,7 @@ from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_depth, decode_jpeg, de
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import PeerError, SpecError, in_words
 from vla_zenoh.keys import LOADING, NO_TASK, STARTING, Kind, worker_node
+from vla_zenoh.nodes.worker import gpus
 from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.frozen import FrozenImages
 from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
@@ -298,6 +299,7 @@ class RobotSession:
                 "prompt": task.prompt if task else "",
                 "obeyed": bool(task and task.active and task.worker == self.name),
                 "batch": self._batch,
+                **gpus.figures(),
             },
             rates_hz={"chunks": self._rate.rate_hz},
             latency_ms={"inference": inference} if inference else {},
