@@ -171,6 +171,9 @@ PACKAGES: Mapping[str, str] = {
     "bench.task": "vla-zenoh-benchmarks",
     "camera.board": "vla-zenoh-calibrate",
     "camera.calibrate": "vla-zenoh-calibrate",
+    "canary.back": "vla-zenoh-canary",
+    "canary.promote": "vla-zenoh-canary",
+    "canary.watch": "vla-zenoh-canary",
     "compare": "vla-zenoh-benchmarks",
     "conform.camera": "vla-zenoh-conform",
     "conform.robot": "vla-zenoh-conform",
@@ -188,6 +191,7 @@ PACKAGES: Mapping[str, str] = {
     "node.primitives": "vla-zenoh-primitives",
     "node.ros2": "vla-zenoh-ros2",
     "node.rolling": "vla-zenoh-rolling",
+    "otel": "vla-zenoh-otel",
     "profile.bridge-config": "vla-zenoh-ros2",
     "profile.new": "vla-zenoh-newarm",
     "replay": "vla-zenoh-replay",
@@ -211,6 +215,7 @@ PACKAGES: Mapping[str, str] = {
 """Command of a package in ``plugins/`` -> that package, for a computer that lacks it."""
 NEEDED: Mapping[str, tuple[str, ...]] = {
     "lerobot_robot_vla_zenoh": ("vla-zenoh-policy-servers",),
+    "vla-zenoh-canary": ("vla-zenoh-benchmarks",),
     "vla-zenoh-dataset": ("vla-zenoh-policy-servers",),
     "vla-zenoh-figures": ("vla-zenoh-benchmarks",),
     "vla-zenoh-inspect": ("vla-zenoh-policy-servers", "vla-zenoh-primitives"),

@@ -80,6 +80,10 @@ COMMANDS: Panels = {
             "Guarded motions: go to a pose, home, grip, run a model until a condition holds.",
             dict.fromkeys(("move-to", "home", "grip", "run"), OF_A_PACKAGE),
         ),
+        "canary": CommandGroup(
+            "Try a new model in shadow on several robots; promote it or take it back.",
+            dict.fromkeys(("watch", "promote", "back"), OF_A_PACKAGE),
+        ),
         "web": OF_A_PACKAGE,
         "serve": CommandGroup(
             "Offer a model to clients of other frameworks.",
@@ -93,6 +97,7 @@ COMMANDS: Panels = {
         "save": OF_A_PACKAGE,
         "replay": OF_A_PACKAGE,
         "eval": "lab.cli.evaluate:evaluation",
+        "otel": OF_A_PACKAGE,
         "keys": "lab.cli.keys:keys",
         "echo": "lab.cli.keys:echo",
     },

@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.actions import chunk_poses, step_width
+from vla_zenoh.control.actions import Steps, chunk_poses, step_joints, step_width
 from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, interpolate, log3, pose_of
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec
@@ -31,10 +32,14 @@ GRIPPER_SHARE = 0.25
 
 
 class ArmState(NamedTuple):
-    """Measured pose and opening of the gripper."""
+    """Measured pose and opening of the gripper, and the joints (n,) in the order of the arm.
+
+    Without joints, actions in joints cannot be compared.
+    """
 
     pose: Pose
     width_m: float
+    joints_rad: FloatArray | None = None
 
 
 def arm_state(run: Run, stamp_ns: int) -> ArmState:
@@ -111,20 +116,47 @@ class Disagreement:
 
 
 def requested_path(
-    spec: ActionSpec, chunk: ActionChunk, start: ArmState, max_width_m: float
+    spec: ActionSpec,
+    steps: Steps,
+    start: ArmState,
+    max_width_m: float,
+    arm: Kinematics | None = None,
 ) -> RequestedPath:
-    """Waypoints that `chunk` requests from `start`.
+    """Waypoints of the TCP that the `steps` (H, D) of a chunk request from `start`.
+
+    Args:
+        spec: meaning of the steps.
+        steps: of one arm.
+        start: where the arm is.
+        max_width_m: of its gripper.
+        arm: places the TCP of actions in joints.
 
     Raises:
-        RecordError: a step that does not fit the spec.
+        RecordError: a step that does not fit the spec; actions in joints, and neither `arm` nor the
+            joints of `start` are known.
     """
-    if spec.space == "joint":
+    if spec.space != "joint":
+        poses = [start.pose, *chunk_poses(spec, steps, start.pose)]
+    elif arm is None or start.joints_rad is None:
         raise RecordError("actions in joints are no poses, which are what is compared")
-    poses, widths_m = [start.pose, *chunk_poses(spec, chunk.steps, start.pose)], [start.width_m]
-    for step in chunk.steps:
+    else:
+        poses = _poses_of_joints(spec, steps, start.joints_rad, arm)
+    widths_m = [start.width_m]
+    for step in steps:
         width_m = step_width(spec, step, widths_m[-1], max_width_m)
         widths_m.append(widths_m[-1] if width_m is None else width_m)
     return RequestedPath(spec.dt_s, poses, None if spec.gripper == "none" else widths_m)
+
+
+def _poses_of_joints(
+    spec: ActionSpec, steps: Steps, start_rad: FloatArray, arm: Kinematics
+) -> list[Pose]:
+    before_rad, poses = start_rad, [arm.forward(start_rad)]
+    for step in steps:
+        ordered = arm.ordered(spec.joints, step[: spec.arm_size])
+        before_rad = step_joints(spec, ordered, before_rad, start_rad)
+        poses.append(arm.forward(before_rad))
+    return poses
 
 
 def disagreement(
@@ -138,16 +170,16 @@ def disagreement(
     tolerance_s: float = DEFAULT_TOLERANCE_S,
 ) -> Disagreement:
     """Difference between workers A and B. `standing_at`: state of the arm at a wall time (ns)."""
-    pairs = _pairs(a, b, round(tolerance_s * 1e9))
-    rows: list[_Row] = []
+    pairs = paired(a, b, round(tolerance_s * 1e9))
+    rows: list[Difference] = []
     unreadable = 0
     for one, other in pairs:
         start = standing_at(one.observation_stamp_ns)
         try:
             rows.append(
-                _row(
-                    requested_path(spec_a, one, start, max_width_m),
-                    requested_path(spec_b, other, start, max_width_m),
+                difference(
+                    requested_path(spec_a, one.steps, start, max_width_m),
+                    requested_path(spec_b, other.steps, start, max_width_m),
                     max_width_m,
                 )
             )
@@ -157,7 +189,7 @@ def disagreement(
     if not rows:
         return Disagreement(*counts)
     apart_s = [abs(p.observation_stamp_ns - q.observation_stamp_ns) / 1e9 for p, q in pairs]
-    differences = np.array([row.difference for row in rows])
+    differences = np.array([row.motion for row in rows])
     cosines = [row.cosine for row in rows if row.cosine is not None]
     grips = [row.gripper for row in rows if row.gripper is not None]
     return Disagreement(
@@ -175,17 +207,27 @@ def disagreement(
     )
 
 
-class _Row(NamedTuple):
+class Difference(NamedTuple):
+    """Between two paths from one start, at the end of the shorter one.
+
+    Args:
+        after_s: time ahead.
+        motion: (6,) along `AXES`, m and rad.
+        cosine: between the directions; None: one of them does not move.
+        gripper: whether the requested widths differ; None: not both have one.
+    """
+
     after_s: float
-    difference: FloatArray
+    motion: FloatArray
     cosine: float | None
     gripper: bool | None
 
 
-def _row(one: RequestedPath, other: RequestedPath, max_width_m: float) -> _Row:
+def difference(one: RequestedPath, other: RequestedPath, max_width_m: float) -> Difference:
+    """How far the other path ends from the first one."""
     after_s = min(one.end_s, other.end_s)
     (pose_a, width_a), (pose_b, width_b) = one.at(after_s), other.at(after_s)
-    difference = np.concatenate(
+    motion = np.concatenate(
         [pose_b.position_m - pose_a.position_m, log3(pose_b.rotation @ pose_a.rotation.T)]
     )
     start = one.poses[0].position_m
@@ -197,10 +239,10 @@ def _row(one: RequestedPath, other: RequestedPath, max_width_m: float) -> _Row:
     gripper = None
     if width_a is not None and width_b is not None:
         gripper = abs(width_b - width_a) > GRIPPER_SHARE * max_width_m
-    return _Row(after_s, difference, cosine, gripper)
+    return Difference(after_s, motion, cosine, gripper)
 
 
-def _pairs(
+def paired(
     a: Sequence[ActionChunk], b: Sequence[ActionChunk], tolerance_ns: int
 ) -> list[tuple[ActionChunk, ActionChunk]]:
     """Pairs nearest in time, each chunk used once, in the order of A's observations."""

@@ -1,0 +1,1 @@
+"""A new model in shadow on several robots: its figures, its promotion, and the way back."""
