@@ -1,8 +1,9 @@
 """Robot descriptions that ship with the package: ``python scripts/descriptions.py`` writes them.
 
-Kinematics, ranges and masses are the numbers that the makers publish; shapes are cylinders, balls
-and boxes of our own. `tests/contract/test_shipped_descriptions.py` compares them
-with the makers' files, where the extra ``meshes`` is installed.
+Kinematics, ranges and masses are the makers' numbers, as their descriptions in example-robot-data
+have them; shapes are cylinders, balls and boxes of our own.
+`tests/contract/test_shipped_descriptions.py` compares them with the makers' files, where the extra
+``meshes`` is installed.
 """
 
 from __future__ import annotations
@@ -351,9 +352,9 @@ PANDA_JOINTS = [
     ),
 ]
 PANDA = """A Franka Panda with its hand, written by scripts/descriptions.py.
-     Frames and ranges are those that Franka documents ("Robot and interface specifications"),
-     masses those of its public description (franka_description). The shapes are cylinders, balls
-     and boxes of our own, in places two centimetres off."""
+     Frames, ranges and masses are Franka's numbers, as its public description (franka_description,
+     Apache-2.0) has them. The shapes are cylinders, balls and boxes of our own, in places two
+     centimetres off."""
 
 # -- SO-101 ---------------------------------------------------------------------------------------
 MOTOR_Z_M = (-0.0015, 0.0375)
@@ -537,8 +538,9 @@ SO101_JOINTS = [
     ),
 ]
 SO101 = """An SO-101, written by scripts/descriptions.py.
-     Frames, ranges and masses are the numbers that The Robot Studio publishes with the arm's parts
-     (SO-ARM100). The shapes are boxes and cylinders of our own, in places two centimetres off."""
+     Frames, ranges and masses are The Robot Studio's numbers, as its public description (SO-ARM100,
+     Apache-2.0) has them. The shapes are boxes and cylinders of our own, in places two centimetres
+     off."""
 
 DESCRIPTIONS = {
     "panda.urdf": urdf("panda", PANDA, PANDA_LINKS, PANDA_JOINTS),
