@@ -438,7 +438,7 @@ CHECKED: list[tuple[str, str]] = [
     ),
     (
         "limits: {workspace: {x_m: [0.6, 0.75]}}",
-        "panda_sim.yaml:20): puts the TCP at (0.430, -0.000, 0.160) m",
+        "panda_sim.yaml:20): puts the TCP at (0.430, 0.000, 0.160) m",
     ),
     ("workers: [scripted, pi9]", "lab.yaml:2: workers: no model called 'pi9'. Known: brick, gro"),
     (

@@ -132,7 +132,8 @@ def test_the_pose_state_carries_the_reference_it_was_given() -> None:
     reference = world.hold_reference()
     state = world.pose_state(reference)
     assert np.allclose(state.position_m, state.reference_position_m, atol=POSE_ATOL)
-    assert np.allclose(state.quat_xyzw, state.reference_quat_xyzw, atol=POSE_ATOL)
+    assert state.reference_quat_xyzw is not None
+    assert abs(state.quat_xyzw @ state.reference_quat_xyzw) == pytest.approx(1.0, abs=POSE_ATOL)
     assert np.allclose(np.abs(state.quat_xyzw), (1.0, 0.0, 0.0, 0.0), atol=1e-6)
 
 

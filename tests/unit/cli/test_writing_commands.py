@@ -45,8 +45,9 @@ READ = {
 """Files and folders that commands read."""
 LOGS = {"up log_dir", "node rolling folder"}
 """Folders of files that are appended to, and turned over."""
-EDITED = {"camera calibrate write"}
-"""A profile in which keys are set; a backup is kept: `tests/unit/lab/test_calibrate_command.py`."""
+EDITED = {"camera calibrate write", "canary promote file", "canary back file"}
+"""A profile in which keys are set; a backup is kept: `tests/unit/lab/test_calibrate_command.py`.
+The file of a canary, which is told who was promoted: `tests/unit/lab/test_canary.py`."""
 CERTIFICATES = {"secure init folder", "secure here folder", "secure show folder"}
 """Folders whose files only ``secure add --renew`` replaces; see `tests/unit/security`."""
 NAMED = ("file", "folder", "out", "save", "into", "directory")
@@ -84,6 +85,7 @@ WRITERS = {
     "bench command": Writer("bench command", "out.json"),
     "bench task": Writer("bench task --model hold", "out"),
     "bench sim": Writer("bench sim metaworld --worker scripted", "out"),
+    "canary watch": Writer("canary watch scripted", "out.json"),
     "camera list": Writer("camera list", "out"),
     "camera board": Writer("camera board", "out.pdf"),
     "camera calibrate": Writer("camera calibrate front --recording RUN", "out"),

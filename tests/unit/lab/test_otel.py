@@ -13,6 +13,7 @@ from camera_rig import await_match, free_endpoint, until
 from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from vla_zenoh_otel.cli import http_url
 from vla_zenoh_otel.export import Exporter
 from vla_zenoh_otel.follow import follow
 from vla_zenoh_otel.journeys import PATIENCE_NS, STAGES, Journey, Journeys, trace_id
@@ -207,3 +208,12 @@ def test_traces_arrive_over_otlp_as_they_were_sent(receiver: Receiver) -> None:
     assert {span.trace_id for span in spans} == {wanted}
     command = next(span for span in spans if span.name == "command")
     assert (command.start_time_unix_nano, command.end_time_unix_nano) == TIMES_NS[5:7]
+
+
+@pytest.mark.parametrize(
+    "text", ["localhost:4318", "ftp://a/", "http://", "http://a b/", "http://a:99999/"]
+)
+def test_what_is_no_url_of_a_receiver_is_rejected(text: str) -> None:
+    with pytest.raises(ValueError, match="is no URL such as http"):
+        http_url(text)
+    assert http_url("https://traces.lab:4318/v1/traces")

@@ -67,16 +67,20 @@ class DemandOptions:
     max_apart_mm: Annotated[
         float | None,
         typer.Option(
-            "--max-apart-mm", min=0, help="p95 of how far chunks end apart. Default: any."
+            "--max-apart-mm", min=0, max=1e4, help="p95 of how far chunks end apart. Default: any."
         ),
     ] = None
     max_apart_mrad: Annotated[
         float | None,
-        typer.Option("--max-apart-mrad", min=0, help="The same, of orientations. Default: any."),
+        typer.Option(
+            "--max-apart-mrad", min=0, max=3200, help="The same, of orientations. Default: any."
+        ),
     ] = None
     max_age_ms: Annotated[
         float | None,
-        typer.Option("--max-age-ms", min=0, help="p95 of the age of its chunks. Default: any."),
+        typer.Option(
+            "--max-age-ms", min=0, max=1e6, help="p95 of the age of its chunks. Default: any."
+        ),
     ] = None
 
     def demands(self) -> Demands:
@@ -116,7 +120,7 @@ def watch(
     How far their chunks end apart, latency, age and rejected chunks go into a file, with their
     number and time: `canary promote FILE` decides by it.
     """
-    with target.client() as client, output_file(output, force=force) as file:
+    with output_file(output, force=force) as file, target.client() as client:
         names = _names(robots) or client.profile.serves.get(worker, (client.keys.robot,))
         clients = _clients(client, names)
         others = {name: _other(each, worker, against) for name, each in clients.items()}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Annotated
+from urllib.parse import urlsplit
 
 import typer
 
@@ -15,6 +17,18 @@ if TYPE_CHECKING:
     from vla_zenoh_otel.journeys import Journey
 
 
+def http_url(text: str) -> str:
+    """Parse the URL of a receiver, or raise a `ValueError`."""
+    try:
+        parts = urlsplit(text)
+        known = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
+    except ValueError:
+        known = False
+    if not known or re.search(r"\s", text):
+        raise ValueError(f"{text!r} is no URL such as http://localhost:4318/v1/traces")
+    return text
+
+
 @options
 def otel(
     target: RobotTarget,
@@ -22,6 +36,8 @@ def otel(
         str | None,
         typer.Option(
             "--endpoint",
+            parser=http_url,
+            metavar="URL",
             help="Where an OTLP receiver takes traces. Default: as OTEL_EXPORTER_OTLP_ENDPOINT and "
             "its like say, else http://localhost:4318/v1/traces.",
         ),

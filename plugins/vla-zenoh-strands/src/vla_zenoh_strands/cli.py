@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.cli.options import options
+from vla_zenoh.cli.options import node_name, options
 from vla_zenoh.cli.output import console
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.client.remote_robot import RemoteRobot
@@ -21,7 +21,8 @@ from vla_zenoh_strands import wire
 def serve(
     target: RobotTarget,
     name: Annotated[
-        str | None, typer.Option("--name", help="Of our peer; the robot's if left out.")
+        str | None,
+        typer.Option("--name", parser=node_name, help="Of our peer; the robot's if left out."),
     ] = None,
     obey: Annotated[
         list[str] | None,

@@ -170,14 +170,14 @@ class Peer:
     def _obey_stops(self) -> None:
         while not self._ended.is_set():
             too_large = self._estop.wait(STATE_S) is False and bool(self._estop.pop_rejected())
-            sample = self._estop.pop()
-            if sample is None and not too_large:
+            arrival = self._estop.pop()
+            if arrival is None and not too_large:
                 continue
             self._theirs = True  # before it is put: what it latches is not told back
             self._cancelled.set()
             StopClient.stop(self._robot)  # the subclass's waits
             self._count("estop")
-            issuer = self._issuer(sample.sample.payload.to_bytes() if sample else b"")
+            issuer = self._issuer(arrival.sample.payload.to_bytes() if arrival else b"")
             LOG.warning("emergency stop of %s on the mesh", issuer)
             self._follow_stop(issuer)
 
