@@ -195,3 +195,14 @@ def test_the_graph_of_the_policy_does_not_tell_on_whose_computer_it_was_made() -
     graph = (ROOT / "models" / "brick" / "brick.onnx").read_bytes()
     assert b"site-packages" not in graph
     assert b'.py"' not in graph
+
+
+def test_no_two_files_of_tests_have_one_name() -> None:
+    """Of those that run together: pytest imports them by it."""
+    apart = {"models", "rivals"}
+    files = [
+        path.name
+        for path in (ROOT / "tests").rglob("test_*.py")
+        if not apart & set(path.relative_to(ROOT).parts)
+    ]
+    assert [name for name in sorted(set(files)) if files.count(name) > 1] == []
