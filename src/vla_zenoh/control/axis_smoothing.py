@@ -129,6 +129,7 @@ class AxisSmoother:
         dt_s: duration of a tick.
         box: (3, n) limits of velocity, acceleration and jerk of every axis at full shares.
         groups: axes that have a straight line of their own; by default all together.
+        within: (m,) least and greatest positions of the first m axes; None: any.
     """
 
     def __init__(
@@ -137,8 +138,9 @@ class AxisSmoother:
         dt_s: float,
         box: FloatArray,
         groups: tuple[slice, ...] = (slice(None),),
+        within: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
-        self._dt_s, self.box, self._groups = dt_s, box, groups
+        self._dt_s, self.box, self._groups, self._within = dt_s, box, groups, within
         self.failures = 0
         self.stand(position)
 
@@ -166,7 +168,7 @@ class AxisSmoother:
             shares: of the limits; a faster motion slows down within them. More jerk is used if the
                 arm would otherwise exceed the velocity limit first, or reverse.
             all_to_stop: use all of acceleration and jerk if the shares do not suffice to stop at
-                `target`. To stay in the box they are used in any case.
+                `target`. To stay `within` they are used in any case.
 
         Returns:
             whether the shares suffice.
@@ -256,8 +258,17 @@ class AxisSmoother:
         return plan, False
 
     def _leaves(self, plan: AxisPlan) -> bool:
-        """Whether a planned motion leaves where it has to stay."""
-        return False
+        """Whether a planned motion leaves where it has to stay; from outside it may enter."""
+        if self._within is None:
+            return False
+        low, high = self._within
+        bounded = slice(len(low))
+        start, end = self.state.position[bounded], plan.end[bounded]
+        least, most = (reached[bounded] for reached in plan.extrema())
+        low, high = low - OVERSHOOT, high + OVERSHOOT
+        below = (np.minimum(start, end) >= low) & (least < low)
+        above = (np.maximum(start, end) <= high) & (most > high)
+        return bool(below.any() or above.any())
 
     def _coordinates(self, way: FloatArray, limits: FloatArray) -> tuple[FloatArray, list[float]]:
         """Basis (n, k) with the fewest directions for a motion by `way`, and their limit shares."""

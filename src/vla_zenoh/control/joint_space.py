@@ -279,7 +279,8 @@ class JointPath(AxisSmoother):
         self._before_bound = False
         """It braked before a bound, on the way to what was asked for last."""
         home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
-        super().__init__(home_rad, 1.0 / profile.timing.command_hz, np.array(bounds.motion))
+        dt_s, box = 1.0 / profile.timing.command_hz, np.array(bounds.motion)
+        super().__init__(home_rad, dt_s, box, within=(bounds.lower_rad, bounds.upper_rad))
 
     @property
     def tcp(self) -> Motion:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import OVERSHOOT, AxisPlan, AxisSmoother, AxisState
+from vla_zenoh.control.axis_smoothing import OVERSHOOT, AxisSmoother, AxisState
 from vla_zenoh.control.limits import (
     FULL,
     PAUSE_LEAD_M,
@@ -80,8 +80,7 @@ class Smoother(AxisSmoother):
         bounds_m: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
         self._anchor = np.eye(3)
-        self._bounds_m = bounds_m
-        super().__init__(np.zeros(6), dt_s, limits.box, (slice(0, 3), slice(3, 6)))
+        super().__init__(np.zeros(6), dt_s, limits.box, (slice(0, 3), slice(3, 6)), bounds_m)
         self.reset(pose)
 
     def reset(self, pose: Pose) -> None:
@@ -138,18 +137,6 @@ class Smoother(AxisSmoother):
         twist[3:], change[3:] = self._anchor @ spin, self._anchor @ spin_change
         self.motion = Motion(Pose(position[:3].copy(), rotation), twist, change)
         return self.motion
-
-    def _leaves(self, plan: AxisPlan) -> bool:
-        """Whether a planned motion leaves the box; from outside it may enter."""
-        if self._bounds_m is None:
-            return False
-        low, high = self._bounds_m
-        low, high = low - OVERSHOOT, high + OVERSHOOT
-        start, end = self.state.position[:3], plan.end[:3]
-        least, most = (reached[:3] for reached in plan.extrema())
-        below = (np.minimum(start, end) >= low) & (least < low)
-        above = (np.maximum(start, end) <= high) & (most > high)
-        return bool(below.any() or above.any())
 
     @property
     def _rates(self) -> tuple[FloatArray, FloatArray]:

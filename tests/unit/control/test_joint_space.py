@@ -107,6 +107,27 @@ def test_a_stop_passes_no_joint_s_targets() -> None:
     assert worst_rad < PASSED_RAD
 
 
+def test_joints_stay_in_their_ranges_however_slow_a_fast_arm_is_asked_to_be() -> None:
+    """Goals at the ends of ranges, and limits that shrink in motion: a gentle stop would pass."""
+    rng, path = np.random.default_rng(3), made_path()
+    low, high = path._bounds.lower_rad, path._bounds.upper_rad
+    passed_rad = 0.0
+    for _ in range(60):
+        path.stand(rng.uniform(low, high))
+        for _ in range(int(rng.integers(2, 6))):
+            target = np.clip(path.state.position + rng.uniform(-1.0, 1.0, 7), low, high)
+            share = float(rng.choice([1.0, 0.5, 0.1, 0.02]))
+            path.move_to(target, Shares(share, share**2, share**3))
+            for _ in range(int(rng.integers(5, 120))):
+                path.advance(1.0)
+                joints_rad = path.state.position
+                passed_rad = max(passed_rad, float((low - joints_rad).max()))
+                passed_rad = max(passed_rad, float((joints_rad - high).max()))
+        end_rad = path.braked()
+        passed_rad = max(passed_rad, float((low - end_rad).max()), float((end_rad - high).max()))
+    assert passed_rad < PASSED_RAD
+
+
 @pytest.mark.long
 def test_joints_that_braked_before_a_bound_go_on_when_the_way_is_free() -> None:
     """A new goal makes the way bend towards a bound; at rest the straight way may be free."""
