@@ -434,7 +434,9 @@ class AxisSmoother:
         """Advance the state by `part` of a tick; whether it moves."""
         if self._again is not None and not (self._slows() & self._too_fast).any():
             # They were too fast for their shares, and may go as fast again by the plan there is.
-            self._move_again(*self._again)
+            shares, all_to_stop = self._again
+            self._silence(shares)
+            self._plan_to(self._target, shares, all_to_stop)
         if self._plan is None:
             return False
         self._elapsed_s += part * self._dt_s
@@ -442,9 +444,6 @@ class AxisSmoother:
         if self._elapsed_s >= self._plan.duration_s:
             self._plan = None
         return True
-
-    def _move_again(self, shares: Shares, all_to_stop: bool) -> None:
-        self.move_to(self._target, shares, all_to_stop=all_to_stop)
 
     def braked(self) -> FloatArray:
         """Brake, and return where (n,) the brake will end."""
@@ -475,6 +474,10 @@ class AxisSmoother:
         return self.state[1:]
 
     def _settle(self, shares: Shares) -> None:
+        """Prepare the state for a motion to a new target with these shares."""
+        self._silence(shares)
+
+    def _silence(self, shares: Shares) -> None:
         """Set noise to zero, before a motion with these shares is planned."""
         self._time_scale = shares.jerk ** (1 / 3)
         position, velocity, acceleration = self.state

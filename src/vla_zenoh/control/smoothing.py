@@ -86,7 +86,6 @@ class Smoother(AxisSmoother):
     def reset(self, pose: Pose) -> None:
         """Stand at `pose` without any motion; only while nothing is streamed."""
         self._anchor = orthonormal(pose.rotation)
-        self._aim = pose
         self.stand(np.array([*pose.position_m, 0.0, 0.0, 0.0]))
 
     def stand(self, position: FloatArray) -> None:
@@ -97,12 +96,8 @@ class Smoother(AxisSmoother):
     def target(self, pose: Pose, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Move to `pose` from the present state; see `AxisSmoother.move_to`."""
         self._settle(shares)
-        self._aim = pose
         target = np.array([*pose.position_m, *log3(self._anchor.T @ pose.rotation)])
         return self._plan_to(target, shares, all_to_stop)
-
-    def _move_again(self, shares: Shares, all_to_stop: bool) -> None:
-        self.target(self._aim, shares, all_to_stop=all_to_stop)
 
     def resting_pose(self) -> Pose:
         """Brake, and return where the brake will end."""
