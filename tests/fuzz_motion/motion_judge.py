@@ -402,7 +402,9 @@ class Judge:
     def _lines(self, twist: Array) -> None:
         """While goals stay on a line from where the arm stood, so does the arm."""
         goal_m, goal_rotation = self._goal_arrays()
-        stands = np.abs(twist[:, :3]).max(axis=1) < STILL
+        # A motion turns round at the speed override's part of the speed.
+        speed = np.array([tick.percent for tick in self._told]) / 100.0
+        stands = np.abs(twist[:, :3]).max(axis=1) <= STILL * speed
         # The arm does not turn meanwhile: what turns it may take its own time.
         turns = np.append(True, norms(np.diff(goal_rotation.reshape(-1, 9), axis=0))[:, 0] > SAME)
         turns |= np.abs(twist[:, 3:]).max(axis=1) > STILL
