@@ -38,7 +38,7 @@ import numpy as np
 from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.limits import Slowdown, in_steps, slowest
 from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot
-from vla_zenoh.kinematics.so3 import Pose, norm3, pose_distance
+from vla_zenoh.kinematics.so3 import Pose, interpolate, norm3, pose_distance
 from vla_zenoh.profile import ContactLimits, Limits
 from vla_zenoh.types import Event, FloatArray, JointState, PoseState, Stamped
 
@@ -66,6 +66,8 @@ SPARE_NS = 4_000_000_000
 """Time that a retreat may take beyond that of its path."""
 SPACE_M = 0.002
 """Distance between the poses of a trail."""
+GAP_M = 0.1
+"""Two poses further apart are no motion in between: 2 m/s at 20 Hz."""
 TRAIL_POSES = 60
 """Of a trail: 0.12 m, so that a detour of up to this is left out."""
 RAD_AS_M = 0.05
@@ -326,15 +328,24 @@ class CommandTrail:
             apart = np.linalg.norm(np.array(self._places) - place, axis=1)
             if apart[-1] < SPACE_M:
                 return
-            if apart[-1] > 10 * SPACE_M:
-                self.clear()  # poses in between are missing
+            if apart[-1] > GAP_M:
+                self.clear()
             elif apart.min() < SPACE_M:
                 keep = int(np.argmax(apart < SPACE_M)) + 1
                 del self._poses[keep:], self._places[keep:]
                 return
+            else:
+                self._fill(pose, math.ceil(apart[-1] / (5 * SPACE_M)))
         self._poses.append(pose)
         self._places.append(place)
         del self._poses[:-TRAIL_POSES], self._places[:-TRAIL_POSES]
+
+    def _fill(self, pose: Pose, pieces: int) -> None:
+        """Add poses on the way to `pose`: of a fast arm few are measured."""
+        before = self._poses[-1]
+        between = [interpolate(before, pose, piece / pieces) for piece in range(1, pieces)]
+        self._poses += between
+        self._places += map(_place, between)
 
     def clear(self) -> None:
         """Drop all poses."""

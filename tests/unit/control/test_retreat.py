@@ -441,6 +441,15 @@ def test_what_was_gone_there_and_back_is_left_out() -> None:
     assert max(pose.position_m[0] for pose in trail.back(0.05)) <= 0.012
 
 
+@pytest.mark.parametrize("speed_m_s", [0.05, 0.4, 1.0, 1.7])
+def test_an_arm_of_any_speed_has_a_way_back_at_20_hz(speed_m_s: float) -> None:
+    trail = CommandTrail()
+    for tick in range(6):
+        trail.add(at(tick * speed_m_s / 20.0))
+    back_m = [float(pose.position_m[0]) for pose in trail.back(RELIEF_M)]
+    assert 0.009 < 5 * speed_m_s / 20.0 - back_m[-1] < 0.0215
+
+
 def test_an_arm_that_turned_up_elsewhere_has_no_way_from_there() -> None:
     trail = CommandTrail()
     for x_m in np.arange(0, 0.03, 0.001):
