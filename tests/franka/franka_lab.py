@@ -91,7 +91,8 @@ class Lab:
     def go_on(self) -> None:
         """What a person does: one `vla-zenoh reset`, as soon as the arm is there, and activate."""
         chain = self.chain
-        chain.until("the arm is there", lambda: chain.state("arm") in ("running", "fault"), AGAIN_S)
+        there = ("running", "fault", "latched")
+        chain.until("the arm is there", lambda: chain.state("arm") in there, AGAIN_S)
         if chain.state() in ("fault", "stopped"):
             chain.client.reset()
             chain.until("the reset is enough", chain.client.cleared, AGAIN_S)
