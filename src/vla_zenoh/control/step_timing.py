@@ -55,6 +55,8 @@ EASING = 0.1
 
 Mover = PosePath | JointPath
 """What moves the arm."""
+MIXED = 1.1
+"""Rates of a rotation at their limits are this much larger along the axes of the next plan."""
 
 
 class Arrivals:
@@ -253,18 +255,25 @@ class SpeedScaling:
             speed = min(speed, share)
         # The same motion in more time: acceleration scales with the square of the override, jerk
         # with the cube. Until a faster arm has slowed down it brakes as hard as it may.
-        change, jerk = (override**2, override**3) if _within(mover, override) else FULL[1:]
+        within = _within(mover, override)
+        change, jerk = (override**2, override**3) if within else FULL[1:]
         shares = Shares(*map(min, mover.shares(goal), Shares(speed, change, jerk)))
         enough = mover.go_to(goal, shares, all_to_stop=self.slowing)
-        self.slowing &= not (enough and _within(mover, override))
+        # Planned with more than its share, it is planned again as soon as that suffices.
+        faster = not within and (self.slowing or override < 1.0)
+        self.slowing = faster or (self.slowing and not enough)
         return events
 
 
 def _within(mover: Mover, override: float) -> bool:
-    """Whether the arm moves as slowly as it would at this override, and will continue so."""
+    """Whether the arm moves as slowly as it would at this override, and will continue so.
+
+    What still gets faster is planned within the override, whatever its acceleration: with all of
+    the limits it could accelerate as at full speed. What slows down must be able to end that.
+    """
     most = mover.box * override ** np.array([[1.0], [2.0], [3.0]])
-    speed, change = (np.abs(rates) for rates in mover.axis_rates())
-    return bool(
-        (change <= most[1] * 1.001).all()
-        and (speed + change**2 / (2 * most[2]) <= most[0] * 1.001).all()
-    )
+    velocity, acceleration = mover.axis_rates()
+    speed, change = np.abs(velocity), np.abs(acceleration)
+    slows = velocity * acceleration < 0.0
+    ends = (change <= most[1] * MIXED) & (speed + change**2 / (2 * most[2]) <= most[0] * MIXED)
+    return bool(((speed <= most[0] * MIXED) & (ends | ~slows)).all())

@@ -11,6 +11,7 @@ from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
 from vla_zenoh.control.commander import Setting
+from vla_zenoh.control.step_timing import MIXED
 
 STEP_M, DT_S = 0.02, 0.2
 TEN_STEPS = [[STEP_M, 0, 0, 0, 0, 0, 0]] * 10
@@ -147,3 +148,25 @@ def test_after_a_pause_joints_wait_for_a_new_chunk_as_poses_do(command: str) -> 
     np.testing.assert_allclose(arm.places_m[-1], stands_m, atol=1e-4)
     arm.send(goal_rad)
     arm.settle(goal_rad)
+
+
+@pytest.mark.parametrize("percent", [50.0, 20.0, 5.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_accelerations_are_those_of_the_override_however_goals_turn_and_move(
+    percent: float, seed: int
+) -> None:
+    """Axes of a rotation mix at every goal: none that is a little too fast frees all others."""
+    rng = np.random.default_rng(seed)
+    rig = Rig(dt_s=0.1)
+    rig.put("speed", percent)
+    rig.activate()
+    rig.run(0.2)
+    for _ in range(40):
+        step = rng.uniform(-1, 1, 6) * [STEP_M, STEP_M, STEP_M, 0.1, 0.1, 0.1]
+        rig.send([[*step, 0.0]] * 6)
+        rig.run(0.1)
+    limits, share = rig.profile.limits, (percent / 100.0) ** 2
+    reached = np.abs([command.acceleration for command in rig.commands])
+    assert reached[:, :3].max() <= MIXED * share * limits.translation.acceleration_m_s2
+    assert reached[:, 3:].max() <= MIXED * share * limits.rotation.acceleration_rad_s2
+    assert reached[:, :3].max() > 0.5 * share * limits.translation.acceleration_m_s2
