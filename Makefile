@@ -24,7 +24,7 @@ AT_THE_END := --last-failed --last-failed-no-failures none --reruns 0 -r fEs
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long slow fuzz fuzz-motion mutants soak test-ros2 test-franka test-rivals test-clients test-realsense test-models check format bench flywheel bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
+.PHONY: help setup demo test test-long slow fuzz fuzz-motion mutants soak test-ros2 test-franka test-rivals demo-rivals test-clients test-realsense test-models check format bench flywheel bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -86,6 +86,9 @@ test-franka: $(READY) ## Run the tests of the driver franka against franka-sim, 
 
 test-rivals: $(READY) ## Run the tests against robots' packages of others on Zenoh, each in an environment of its own
 	$(BIN)/python scripts/test_rivals.py $(AGAIN) $(ARGS)
+
+demo-rivals: $(READY) ## Two robots of others on one bus, an agent, a cut link; log and pictures into runs/rivals
+	$(BIN)/python scripts/test_rivals.py --demonstration runs/rivals
 
 test-clients: $(READY) ## Build the clients of the wire in Rust and run their tests; needs cargo
 	cargo test --release --manifest-path examples/wire/rust/Cargo.toml

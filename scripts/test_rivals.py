@@ -1,6 +1,7 @@
 """Tests against others' packages that put robots on Zenoh, each in an environment of its own.
 
     .venv/bin/python scripts/test_rivals.py [PYTEST OPTIONS]
+    .venv/bin/python scripts/test_rivals.py --demonstration FOLDER
 
 uv makes the environments in ``.tools/rivals``, once. Of physicalai only what its robots' transport
 imports is installed: the rest is its inference, half a gigabyte.
@@ -66,6 +67,17 @@ OF_INSPECT = (
     *("-c", str(ROOT / "constraints.txt"), "-e", f"{ROOT}[control]"),
     *(word for name in OURS for word in ("-e", str(ROOT / "plugins" / name))),
 )
+ENVIRONMENTS: tuple[tuple[str, str, tuple[str, ...], tuple[str, ...], str], ...] = (
+    (PHYSICALAI, "physicalai", ALONE, NEEDED, sys.executable),
+    (FRANKA_NODE, "franka-node", (), OF_FRANKA_NODE, sys.executable),
+    (R2C, "r2c", (), OF_R2C, sys.executable),
+    (TROSSEN, "trossen", (), OF_TROSSEN, sys.executable),
+    (STRANDS, "strands", (), OF_STRANDS, "3.12"),
+    (INSPECT, "inspect", (), OF_INSPECT, sys.executable),
+)
+"""Variable, folder, packages without what they need, packages with it, Python or its version."""
+SHOWN = (PHYSICALAI, TROSSEN)
+"""What the demonstration needs."""
 
 
 def environment(
@@ -74,7 +86,7 @@ def environment(
     name: str,
     alone: tuple[str, ...],
     needed: tuple[str, ...],
-    base: str = sys.executable,
+    base: str,
 ) -> str:
     """Make an environment unless it is there; its Python.
 
@@ -109,27 +121,32 @@ def library(uv: str, environ: dict[str, str], package: str) -> str:
     return str(folder)
 
 
-def main() -> int:
-    """Make the environments and run the tests; the exit status."""
-    environ = uv_environment(os.environ)
+def make(environ: dict[str, str], *, demonstration: bool) -> None:
+    """Make the environments, and write into `environ` where they are.
+
+    Args:
+        environ: of the tests; what it names already is not made.
+        demonstration: only what that needs.
+    """
     uv = str(Path(sysconfig.get_path("scripts")) / "uv")
-    if PHYSICALAI not in environ:
-        environ[PHYSICALAI] = environment(uv, environ, "physicalai", ALONE, NEEDED)
-    if FRANKA_NODE not in environ:
-        environ[FRANKA_NODE] = environment(uv, environ, "franka-node", (), OF_FRANKA_NODE)
-    if R2C not in environ:
-        environ[R2C] = environment(uv, environ, "r2c", (), OF_R2C)
-    if TROSSEN not in environ:
-        environ[TROSSEN] = environment(uv, environ, "trossen", (), OF_TROSSEN)
+    for variable, name, alone, needed, base in ENVIRONMENTS:
+        if variable not in environ and not (demonstration and variable not in SHOWN):
+            environ[variable] = environment(uv, environ, name, alone, needed, base)
     paths = library(uv, environ, TROSSEN_ARM), environ.get("PYTHONPATH", "")
     environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
-    if STRANDS not in environ:
-        environ[STRANDS] = environment(uv, environ, "strands", (), OF_STRANDS, base="3.12")
-    if INSPECT not in environ:
-        environ[INSPECT] = environment(uv, environ, "inspect", (), OF_INSPECT)
-    if SIMULATOR not in environ:
+    if SIMULATOR not in environ and not demonstration:
         environ[SIMULATOR] = simulator_environment(uv, environ, *PACKAGES)
-    command = [sys.executable, "-m", "pytest", "-m", "rivals", "tests/rivals", *sys.argv[1:]]
+
+
+def main() -> int:
+    """Make the environments and run the tests, or the demonstration; the exit status."""
+    environ, given = uv_environment(os.environ), sys.argv[1:]
+    demonstration = given[:1] == ["--demonstration"]
+    make(environ, demonstration=demonstration)
+    if demonstration:
+        command = [sys.executable, "tests/rivals/demonstration", *given[1:]]
+    else:
+        command = [sys.executable, "-m", "pytest", "-m", "rivals", "tests/rivals", *given]
     return subprocess.run(command, cwd=ROOT, env=environ, check=False).returncode
 
 

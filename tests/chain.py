@@ -29,11 +29,13 @@ from vla_zenoh.codec import records
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.runtime import launch
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import Event, PoseCommand, PoseState, Task
 
 READY_PATIENCE_S = 90.0
 """From nothing to an arm that obeys, on a busy machine: five interpreters load numpy and more."""
+launch.ROUTER_PATIENCE_S = READY_PATIENCE_S
 END_PATIENCE_S = 10.0
 MOVING_M_S = 0.05
 STILL_M_S = 0.005

@@ -1,6 +1,6 @@
 """Runs in the environment of physicalai: its own owner with an arm of ours, or its own client.
 
-    python physicalai_peer_process.py owner NAME      # until its standard input ends
+    python physicalai_peer_process.py owner NAME [Arm | WidowX]      # until its standard input ends
     python physicalai_peer_process.py client NAME     # a line of JSON in, a line of JSON out
 
 The owner's arm is at once where it is sent. A client's lines: ``{"act": [...]}`` sends an action;
@@ -51,13 +51,22 @@ class Arm:
         self.at = np.array(action)
 
 
-def own(name: str) -> None:
+class WidowX(Arm):
+    """One of six joints and a gripper, in degrees and m."""
+
+    joint_names = (*(f"joint_{number}" for number in range(6)), "gripper")
+
+    def __init__(self) -> None:
+        self.at = np.array([0.0, 68.755, 57.296, -22.918, 0.0, 0.0, 0.02])
+
+
+def own(name: str, arm: str = "Arm") -> None:
     """Own a robot with physicalai's owner."""
     transport = import_module("physicalai.robot.transport")
     stop = threading.Event()
     reader = threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True)
     reader.start()
-    recipe = {"class_path": "physicalai_peer_process.Arm", "init_args": {}}
+    recipe = {"class_path": f"physicalai_peer_process.{arm}", "init_args": {}}
     config = transport.RobotOwnerConfig(name=name, robot=recipe, rate_hz=100.0, idle_timeout=None)
     transport.run_owner(config, stop, ready=lambda: print("READY", flush=True))
 
@@ -78,4 +87,4 @@ def ask(name: str) -> None:
 
 
 if __name__ == "__main__":
-    {"owner": own, "client": ask}[sys.argv[1]](sys.argv[2])
+    {"owner": own, "client": ask}[sys.argv[1]](*sys.argv[2:])

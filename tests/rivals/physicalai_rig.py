@@ -60,8 +60,8 @@ class Process:
 class Owner(Process):
     """physicalai's owner of an arm that is at once where it is sent."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__("owner", name)
+    def __init__(self, name: str, arm: str = "Arm") -> None:
+        super().__init__("owner", name, arm)
         while self.line() != "READY":
             pass
 
