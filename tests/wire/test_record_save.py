@@ -19,10 +19,14 @@ from vla_zenoh_rolling.ring import PART
 from vla_zenoh_rolling.settings_log import LOG, entries_of
 
 from vla_zenoh.bus import clock
-from vla_zenoh.bus.session import open_session
+from vla_zenoh.bus.clock import Clock
+from vla_zenoh.bus.node import Publisher
+from vla_zenoh.bus.session import Kind, open_session
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import ROLLING
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.recording.run import load_run
+from vla_zenoh.types import Event
 
 SHORT = RingLimits(keep_s=4.0, max_bytes=40 * 1024**2, segment_s=1.0, after_s=0.5)
 LOGGED_S = 30.0
@@ -148,6 +152,23 @@ def test_it_is_saved_on_request(chain: Chain, tmp_path: Path) -> None:
         assert "asked: it looked odd" in done.stdout
         (entry,) = record.until("it is logged, too", lambda: record.entries("saved"))
         assert entry["reasons"] == ["asked: it looked odd"]
+
+
+def test_samples_that_never_arrived_are_named_by_save_log_and_evaluation(
+    chain: Chain, tmp_path: Path
+) -> None:
+    key = chain.profile.keys.event("arm")
+    with kept(chain, tmp_path) as record:
+        stream = Publisher(chain.session, key, Kind.ORDER, "arm#1", Clock())
+        for seq in (0, 40, 41):  # a link that was closed and opened again
+            stream.publish(Event("info", "notice", "test", "still here"), seq=seq)
+            time.sleep(1.2 * SHORT.segment_s)
+        done = command_line("save", "a gap", profile=chain.profile_file)
+        assert "but for 39 samples that never arrived" in done.stdout, done.stderr
+        (folder,) = record.saved()
+        assert record.entries("lost") == [{"samples": {"event/arm": 39}}]
+    problems = evaluate_loaded(load_run(folder)).problems
+    assert f"samples never reached the recorder: {key} 39" in problems
 
 
 def test_without_a_rolling_record_a_request_says_so(chain: Chain) -> None:

@@ -62,6 +62,7 @@ class StopAttempt:
                 self.why = str(error).partition(". ")[0]
                 self.over.wait(RETRY_S)
                 continue
+            self.profile = profile  # with the host of the certificate that is used
             try:
                 self._stop(profile, session)
             except (SessionError, zenoh.ZError) as error:
@@ -73,6 +74,11 @@ class StopAttempt:
         self.why = "no node of it answers"
         known = [profile.robot.name]
         self._add(session, profile.keys)
+        client = self.clients[0]
+        there = "" if self._every else self.target.alive(client, "stop")
+        if there and not client.alive:
+            every = self.target.typed("stop", "--all")
+            self.why = f"no node of it answers. {there}; `{every}` stops all"
         while not self.over.is_set():
             for robot in alive_robots(session, profile.keys) if self._every else ():
                 if robot not in known:
@@ -142,7 +148,7 @@ def _watch(attempt: StopAttempt, *, every: bool, as_json: bool) -> StopOutcome:
         worst = max((each.outcome for each in progress.values()), key=order.index)
         done = worst is StopOutcome.CONFIRMED and now_s > discovering_s
         if done or now_s > began_s + GIVE_UP_S:
-            if not every and done and not as_json:
+            if not every and worst is not StopOutcome.NOT_CONFIRMED and not as_json:
                 _warn_of_others(attempt)
             return worst
         time.sleep(POLL_S)

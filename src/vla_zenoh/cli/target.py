@@ -143,10 +143,14 @@ class RobotTarget:
         """Message that this robot has no such node, with `command` for the other robots."""
         if client.other_version:
             return f"no {kind} of {self.named(client)} can be read: {client.other_version}"
-        others = [f"{name} (`{self.typed(*command, robot=name)}`)" for name in self.others(client)]
-        there = f"Alive on this router: {', '.join(others)}"
         none = "No other robot is visible on this router; `vla-zenoh up` starts one"
-        return f"no {kind} of {self.named(client)} is alive. {there if others else none}"
+        there = self.alive(client, *command) or none
+        return f"no {kind} of {self.named(client)} is alive. {there}"
+
+    def alive(self, client: StopClient, *command: str) -> str:
+        """Other robots whose command node is alive, with `command` for each; empty: none."""
+        others = [f"{name} (`{self.typed(*command, robot=name)}`)" for name in self.others(client)]
+        return f"Alive on this router: {', '.join(others)}" if others else ""
 
     def others(self, client: StopClient) -> list[str]:
         """Other robots whose command node is alive."""

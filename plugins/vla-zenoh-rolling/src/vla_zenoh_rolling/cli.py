@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -41,13 +39,11 @@ def rolling(
     At a stop, a fault, a rejected activation or `vla-zenoh save` the minutes are kept in a
     folder of their own. It runs at a low priority.
     """
-    from vla_zenoh_rolling.node import NICE, RingLimits, RollingRecord
+    from vla_zenoh_rolling.node import RingLimits, RollingRecord
 
     loaded = target.load()
     place = folder or rolling_folder(default_log_folder(), loaded)
     limits = RingLimits(keep_s=60 * minutes, max_bytes=megabytes * 1024 * 1024)
-    with suppress(OSError):
-        os.nice(NICE)
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
         RollingRecord(loaded, session, place, limits).run(stop)

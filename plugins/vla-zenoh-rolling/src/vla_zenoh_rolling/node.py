@@ -19,6 +19,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,8 @@ from vla_zenoh_rolling.ring import PART, Ring, RingLimits, delete_oldest_saved
 from vla_zenoh_rolling.settings_log import SettingsLog, logs_of
 
 NICE = 10
-"""Everything that moves the arm goes first."""
+"""Of the thread that writes: everything that moves the arm goes first. Zenoh's threads, which begin
+before it, keep their priority: a router closes the link of a client that does not take samples."""
 QUEUE_BYTES, QUEUE_SAMPLES = 64 * 1024 * 1024, 50_000
 APART_S = 60.0
 """Between two automatic savings for rejected activations: a person who tries again and again."""
@@ -91,6 +93,8 @@ class RollingRecord:
         self._path = Path()
         self._began_s = self._committed_s = self._try_s = 0.0
         self._seen_drops: Counter[str] = Counter()
+        self._seen_lost: Counter[str] = Counter()
+        self._arrived: Counter[str] = Counter()
         self._why = self._log_why = ""
         self._lost: Counter[str] = Counter()
         self._lost_s = 0.0
@@ -104,6 +108,8 @@ class RollingRecord:
     # -- life ---------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL_S)
+        with suppress(OSError):
+            os.nice(NICE)
         self._note_beginning()
         keys = self.node.keys
         settings = (keys.prompt, keys.active, keys.worker, keys.rate, keys.speed, keys.slower)
@@ -125,6 +131,7 @@ class RollingRecord:
             self._add("clock", step_s=round(clock_step_s, 3))
             self.node.reject("clock_step", f"the wall clock was set by {clock_step_s:+.3f} s")
         samples = self._queue.take()
+        self._count(samples)
         self._note(samples)
         self._write_log()
         self._write_samples(samples)
@@ -263,6 +270,14 @@ class RollingRecord:
             self._log.lost = 0
 
     # -- the ring -----------------------------------------------------------------------------
+    def _count(self, samples: list[Sample]) -> None:
+        """Samples that never arrived leave a gap in the numbers of their key."""
+        for sample in samples:
+            if sample.header is not None:
+                self._arrived[sample.key] += 1
+                arrived = self._arrived[sample.key] + self._queue.dropped[sample.key]
+                self.node.traffic.received(sample.key, sample.header, arrived)
+
     def _write_samples(self, samples: list[Sample]) -> None:
         now_s = time.monotonic()
         try:
@@ -302,15 +317,18 @@ class RollingRecord:
         writer, self._writer = self._writer, None
         if writer is None:
             return
-        dropped = Counter(self._queue.dropped)
-        new, self._seen_drops = dropped - self._seen_drops, dropped
-        if new:
-            self._add("dropped", samples={self.node.keys.short(key): new[key] for key in new})
+        dropped, lost = Counter(self._queue.dropped), Counter(self.node.traffic.lost)
+        missing = {"dropped": dropped - self._seen_drops, "lost": lost - self._seen_lost}
+        self._seen_drops, self._seen_lost = dropped, lost
+        for what, new in missing.items():
+            if new:
+                self._add(what, samples={self.node.keys.short(key): new[key] for key in new})
         try:
-            writer.finish({"dropped": dict(new)})
+            writer.finish(missing)
         except RecordingError as error:
             self._disk_failed(str(error), 0)
-        self._ring.add(self._path, time.monotonic() - self._began_s)
+        count = sum(new.total() for new in missing.values())
+        self._ring.add(self._path, time.monotonic() - self._began_s, count)
 
     def _disk_failed(self, why: str, samples: int) -> None:
         """Say so, make room where that is ours to make, and try again soon."""
@@ -354,7 +372,9 @@ class RollingRecord:
             return
         self._saved = str(folder)
         self._add("saved", folder=folder.name, reasons=reasons, segments=count)
-        said = f"the last {self._ring.seconds:.0f} s are in {folder}: {'; '.join(reasons)}"
+        missing = self._ring.missing
+        but = f", but for {missing} samples that never arrived or did not fit" if missing else ""
+        said = f"the last {self._ring.seconds:.0f} s{but} are in {folder}: {'; '.join(reasons)}"
         self.node.emit(Event("info", "notice", "saved", said[:1000]))
         for gone in delete_oldest_saved(saved, KEPT_SAVED):
             self._add("deleted", folder=gone.name)
@@ -366,6 +386,7 @@ class RollingRecord:
             "folder": str(self._folder),
             "seconds": round(self._ring.seconds, 1),
             "size_bytes": self._ring.size_bytes + size,
+            "missing": self._ring.missing,
             "saved": self._saved,
             "why": self._why or self._log_why,
         }
@@ -375,6 +396,7 @@ class RollingRecord:
         if not self.node.status_due(state):
             return
         self.node.counters["dropped"] = self._queue.dropped.total()
+        self.node.counters["lost"] = self.node.traffic.lost.total()
         self.node.publish_status(state, detail=self._detail())
 
 

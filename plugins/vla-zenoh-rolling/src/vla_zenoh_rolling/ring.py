@@ -19,11 +19,12 @@ FACTS = "saved.json"
 
 
 class Segment(NamedTuple):
-    """A file of the ring."""
+    """A file of the ring, with the number of samples that are missing in it."""
 
     path: Path
     seconds: float
     size_bytes: int
+    missing: int = 0
 
 
 class RingLimits(NamedTuple):
@@ -69,16 +70,20 @@ class Ring:
     def size_bytes(self) -> int:
         return sum(each.size_bytes for each in self.segments)
 
+    @property
+    def missing(self) -> int:
+        return sum(each.missing for each in self.segments)
+
     def next_path(self) -> Path:
         """Of the file to write next."""
         path = self._folder / SEGMENT.format(self._next)
         self._next += 1
         return path
 
-    def add(self, path: Path, seconds: float) -> None:
+    def add(self, path: Path, seconds: float, missing: int = 0) -> None:
         """Take a finished file into the ring, and delete what is too old or too much."""
         with suppress(OSError):
-            self.segments.append(Segment(path, seconds, path.stat().st_size))
+            self.segments.append(Segment(path, seconds, path.stat().st_size, missing))
         while len(self.segments) > 1 and (
             self.seconds - self.segments[0].seconds >= self._limits.keep_s
             or self.size_bytes > self._limits.max_bytes

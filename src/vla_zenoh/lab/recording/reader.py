@@ -96,13 +96,14 @@ class Recording:
             wanted: whether to read a key; other keys are skipped undecoded.
         """
         self.damage, self.ended = "", None
-        dropped: Counter[str] = Counter()
+        missing = {"dropped": Counter[str](), "lost": Counter[str]()}
         for path in segments_of(self.path) or [self.path]:
             self.ended = None
             yield from self._entries_of(path, wanted)
-            dropped.update(self._dropped())
+            for what, counts in missing.items():
+                counts.update(self._missing(what))
         if self.ended is not None:
-            self.ended["dropped"] = dict(dropped)
+            self.ended |= missing
 
     def _entries_of(self, path: Path, wanted: Callable[[str], bool]) -> Iterator[Sample]:
         schemas: dict[int, Schema] = {}
@@ -137,10 +138,10 @@ class Recording:
     @property
     def dropped(self) -> int:
         """Samples that the recorder dropped, once `entries` has read the end."""
-        return sum(self._dropped().values())
+        return sum(self._missing("dropped").values())
 
-    def _dropped(self) -> dict[str, int]:
-        counts = (self.ended or {}).get("dropped")
+    def _missing(self, what: str) -> dict[str, int]:
+        counts = (self.ended or {}).get(what)
         counted = counts.items() if isinstance(counts, dict) else ()
         return {key: count for key, count in counted if type(count) is int}
 
