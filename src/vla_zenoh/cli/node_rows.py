@@ -20,6 +20,8 @@ MODE_WORDS = {
 }
 """Mode -> (prefix of what moves, sentence, style)."""
 MISSING, DEAD = "missing", "dead"
+REAL_ROBOTS = frozenset({"arm", "ros2"})
+"""Nodes in whose place `up --sim` starts the node sim."""
 
 
 class NodeRow(NamedTuple):
@@ -41,6 +43,8 @@ def node_rows(
 
     `expected` has the host of each node of the profile; `alive` nodes have a liveliness token.
     """
+    if "sim" in said and mode_of(said) == "sim":
+        expected = {name: host for name, host in expected.items() if name not in REAL_ROBOTS}
     down = hosts_down(said, expected, alive)
     names = {*said, *(name for name, host in expected.items() if host not in down)}
     rows: list[NodeRow] = []

@@ -383,6 +383,9 @@ class Host:
         if not starting:
             self._ready = True
             self._tell("up", f"{self.mode} | ready: {', '.join(sorted(names))}")
+            if self.mode == "LIVE" and self.profile.unconfirmed:
+                guessed = ", ".join(self.profile.unconfirmed)
+                self._tell("up", f"LIVE | rejects activation until these are confirmed: {guessed}")
         elif starting != self._starting:
             self._tell("up", f"{self.mode} | starting: {'; '.join(starting)}")
         self._starting = starting

@@ -95,3 +95,11 @@ def test_limits_that_act_are_those_of_a_living_command_node() -> None:
     said = alive(status("command", limits=["elbow: joint_velocity", "slower: table"]))
     assert acting_limits(said) == ["elbow: joint_velocity", "slower: table"]
     assert acting_limits(alive(status("command", limits=3))) == []
+
+
+def test_the_real_robot_s_node_is_not_missed_where_a_simulated_one_runs_in_its_place() -> None:
+    expected = {"command": "robot", "arm": "robot"}
+    said = alive(status("command", mode="sim"), status("sim"))
+    assert "arm" not in {row.name for row in node_rows(said, expected)}
+    said = alive(status("command", mode="live"), status("sim"))
+    assert "arm" in {row.name for row in node_rows(said, expected)}
