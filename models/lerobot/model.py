@@ -1,7 +1,6 @@
 # /// script
 # requires-python = ">=3.12,<3.14"
 # dependencies = [
-#     "example-robot-data>=6",
 #     "lerobot==0.6.1",
 #     "numpy>=1.26",
 #     "pin>=4",

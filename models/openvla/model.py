@@ -2,7 +2,6 @@
 # requires-python = ">=3.11,<3.14"
 # dependencies = [
 #     "bitsandbytes==0.50.2",
-#     "example-robot-data>=6",
 #     "numpy>=1.26",
 #     "opencv-python-headless>=4.9",
 #     "pillow>=11",

@@ -288,6 +288,24 @@ def test_an_episode_that_lost_its_process_is_begun_again_and_counted_once() -> N
     assert [found[episode].attempts for episode in range(6)] == [1, 1, 2, 1, 3, 1]
 
 
+def test_a_worker_that_keeps_crashing_ends_the_run_while_an_episode_waits_for_it() -> None:
+    left = threading.Event()
+
+    class Waiting(Place):
+        def run(self, asked: EpisodeRequest) -> EpisodeOutcome:
+            left.wait()
+            raise BenchmarkLost("closed")
+
+        def close(self) -> None:
+            left.set()
+
+    def look() -> None:
+        raise NodeError("worker-broken keeps crashing: no module")
+
+    with pytest.raises(NodeError, match="worker-broken keeps crashing"):
+        list(run_at_places([lambda: Waiting({})], [request()], threading.Event(), look))
+
+
 def test_an_episode_that_always_loses_its_process_ends_the_run() -> None:
     with pytest.raises(NodeError, match="reach/far/3: 3 attempts, the last: killed"):
         at_places({3: 9})

@@ -105,6 +105,7 @@ class LocalRun:
         self._stage, self._processes, self._log = stage, processes, log
         self._stack = ExitStack()
         self._file = ""
+        self._look: Callable[[], None] | None = None
 
     def __enter__(self) -> LocalRun:
         stage = self._stage
@@ -122,7 +123,8 @@ class LocalRun:
                 worker_options={stage.setting.worker: stage.worker_options},
                 worker_arguments=arguments,
             )
-            profile = self._stack.enter_context(nodes).profile
+            host = self._stack.enter_context(nodes)
+            profile, self._look = host.profile, host.poll
         folder = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="vla-zenoh-"))
         self._file = f"{folder}/benchmark.yaml"
         Path(self._file).write_text(to_yaml(profile), "utf-8")
@@ -144,19 +146,23 @@ class LocalRun:
             NodeError: benchmark or worker failed, or an episode lost its process three times.
         """
         makers = [lambda index=index: self.place(index) for index in range(self._processes)]
-        yield from run_at_places(makers, requests, stop)
+        yield from run_at_places(makers, requests, stop, self._look)
 
 
 def run_at_places(
-    makers: Sequence[Callable[[], Does]], requests: Sequence[EpisodeRequest], stop: threading.Event
+    makers: Sequence[Callable[[], Does]],
+    requests: Sequence[EpisodeRequest],
+    stop: threading.Event,
+    look: Callable[[], None] | None = None,
 ) -> Iterator[Ended]:
     """Share episodes out; one that loses its place is begun again at a new one.
 
     Args:
         stop: set by Ctrl-C; what has not ended is left out.
+        look: looks after the worker meanwhile, often.
 
     Raises:
-        NodeError: an episode failed, or lost its place three times.
+        NodeError: an episode failed, or lost its place three times; or by `look`.
     """
     waiting: queue.SimpleQueue[EpisodeRequest] = queue.SimpleQueue()
     ended: queue.SimpleQueue[Ended | Exception] = queue.SimpleQueue()
@@ -185,6 +191,8 @@ def run_at_places(
     try:
         left = len(requests)
         while left and not stop.is_set():
+            if look is not None:
+                look()
             try:
                 found = ended.get(timeout=POLL_S)
             except queue.Empty:
