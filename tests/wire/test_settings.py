@@ -213,7 +213,7 @@ def test_the_simulator_places_objects_by_seed_but_not_under_a_moving_arm(chain: 
         time.sleep(0.5)
         return objects_of(chain)
 
-    time.sleep(0.7)  # the pose stream lingers for half a second
+    chain.until("no stream is followed", lambda: chain.detail("following", "sim") is False)
     first, second, again = reset("7"), reset("8"), reset("7")
     assert np.abs(first - again).max() < SAME_M
     assert np.abs(first - second).max() > APART_M

@@ -22,9 +22,11 @@ from vla_zenoh.lab.demo.scripted_motions import STEP_M, STEP_RAD
 
 REACHED_M, REACHED_RAD = 1e-3, 2e-3
 AGAIN_S = 30.0
+# A busy computer stands still for longer than the robot's own watchdog usually allows; no test here
+# looks at that.
 PROFILE = """
 extends: ur5e_rtde
-ur: {{address: {address}}}
+ur: {{address: {address}, watchdog_hz: 1}}
 task: {{prompt: hold, rate_hz: 5, worker: scripted}}
 session: {{listen: [{endpoint}], connect: [{endpoint}]}}
 timing: {{command_timeout_s: {patience_s[command]}, state_timeout_s: {patience_s[state]}}}

@@ -10,7 +10,7 @@ from typing import Literal
 
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, SessionError
-from vla_zenoh.keys import STARTING, worker_node
+from vla_zenoh.keys import CRASHED, STARTING, worker_node
 from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.types import Task
 
@@ -102,11 +102,12 @@ class EpisodeRunner:
         while True:
             status = self.client.status(worker_node(worker))
             loading = status is None or status.state == STARTING
+            crashed = status is not None and status.state == CRASHED
             missing = streams.missing()
             waited_s = time.monotonic() - began_s
             settled = waited_s > SETTLE_PATIENCE_S or self._settled()
             up = settled and self.client.status(COMMAND) is not None
-            if up and not (missing or loading):
+            if up and not (missing or loading or crashed):
                 return
             if waited_s > (READY_PATIENCE_S if missing or not loading else LOAD_PATIENCE_S):
                 lacking = f"; not received: {', '.join(missing)}" if missing else ""
