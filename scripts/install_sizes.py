@@ -18,9 +18,11 @@ from bootstrap import CONSTRAINTS, DEMO, ROOT, drop_headers, uv_environment
 
 UV = Path(sys.executable).parent / "uv"
 ROWS = {
-    "drive, watch, cameras, own models": ("",),
+    "drive, watch, own models": ("",),
+    "camera host": ("camera",),
     "model host, shipped policy": ("brick,secure",),
     "robot host": ("control,record,secure",),
+    "robot host, its cameras too": ("camera,control,record,secure",),
     "robot host, ROS 2": ("record,secure", "vla-zenoh-ros2"),
     "the demo, as `make demo` has it": (DEMO,),
     "simulator and everything in the tutorial": ("all",),

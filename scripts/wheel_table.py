@@ -20,7 +20,8 @@ from bootstrap import ROOT, uv_environment
 
 UV = Path(sys.executable).parent / "uv"
 ROLES: dict[str, tuple[str, ...]] = {
-    "camera, operator, own models": (),
+    "operator, own models": (),
+    "camera host": ("camera",),
     "model host, shipped policy": ("brick", "secure"),
     "robot host": ("control", "record", "secure"),
     "simulator, the demo": ("brick", "sim"),

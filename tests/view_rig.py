@@ -32,6 +32,16 @@ class Shown:
         every = (batch for batch in self._batches[path] if "time" not in batch.schema.names)
         return {name for batch in every for name in batch.schema.names if ":" in name}
 
+    def held(self, path: str, component: str) -> list[Any]:
+        """A component that holds at all times."""
+        every = (batch for batch in self._batches[path] if "time" not in batch.schema.names)
+        return [
+            value
+            for batch in every
+            if component in batch.schema.names
+            for value in batch.column(component).to_pylist()
+        ]
+
     def stamps_ns(self, path: str) -> list[int]:
         """Times of an entity's rows."""
         return [

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 ORDER = (
     # A folder, or a module beside them, imports those of the lines above and of its own line.
     ("errors",),
-    ("keys", "robot", "sanitize", "types"),
+    ("keys", "opencv", "robot", "sanitize", "types"),
     ("plugins",),
     ("resources",),
     ("shipped",),
@@ -253,6 +253,11 @@ def test_importing_what_adapters_share_loads_nothing_that_their_environments_lac
     assert loaded.isdisjoint({*HEAVY, *OPTIONAL, "cv2", "rosbags"})
 
 
+def test_what_drives_a_robot_or_serves_a_model_loads_no_opencv() -> None:
+    nodes = "vla_zenoh.nodes.command.node, vla_zenoh.nodes.worker.node, vla_zenoh.robots.arm"
+    assert loaded_after(f"{nodes}, vla_zenoh.client, vla_zenoh.lab.cli.check").isdisjoint({"cv2"})
+
+
 def test_importing_the_package_loads_no_library_at_all() -> None:
     assert loaded_after("vla_zenoh").isdisjoint({*HEAVY, "numpy", "cv2", "pydantic", "pinocchio"})
 
@@ -263,6 +268,7 @@ OPTIONAL = (
     "mujoco",
     "matplotlib",
     "av",
+    "cv2",
     "flask",
     "zmq",
     "websockets",

@@ -6,20 +6,19 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError, MissingExtraError, RecordingError
+from vla_zenoh.policy.resize import scaled
 
 CODEC, PIXEL_FORMAT = "libx264", "yuv420p"
 
 
 def at_height(rgb: NDArray[np.uint8], height_px: int) -> NDArray[np.uint8]:
     """A picture in another height, not distorted."""
-    size = (max(1, round(rgb.shape[1] * height_px / rgb.shape[0])), height_px)
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return scaled(rgb, max(1, round(rgb.shape[1] * height_px / rgb.shape[0])), height_px)
 
 
 def decoded_at_height(jpeg: bytes, height_px: int) -> NDArray[np.uint8]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +23,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     StatePart,
 )
+from vla_zenoh.policy.resize import scaled
 from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 from vla_zenoh.types import (
     Depth,
@@ -348,20 +348,22 @@ def _resize(rgb: NDArray[Any], spec: CameraSpec | DepthSpec) -> NDArray[Any]:
         return _scale(rgb, spec.width, spec.height)
     fit = min if spec.resize == "pad" else max
     factor = fit(spec.width / width, spec.height / height)
-    scaled = _scale(rgb, max(1, round(width * factor)), max(1, round(height * factor)))
+    small = _scale(rgb, max(1, round(width * factor)), max(1, round(height * factor)))
     out = np.zeros((spec.height, spec.width, *rgb.shape[2:]), rgb.dtype)
-    top, left = (spec.height - scaled.shape[0]) // 2, (spec.width - scaled.shape[1]) // 2
-    cut = scaled[max(-top, 0) :, max(-left, 0) :][: spec.height, : spec.width]
+    top, left = (spec.height - small.shape[0]) // 2, (spec.width - small.shape[1]) // 2
+    cut = small[max(-top, 0) :, max(-left, 0) :][: spec.height, : spec.width]
     top, left = max(top, 0), max(left, 0)
     out[top : top + cut.shape[0], left : left + cut.shape[1]] = cut
     return out
 
 
 def _scale(rgb: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    smaller = width < rgb.shape[1] or height < rgb.shape[0]
-    method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-    if rgb.ndim == 2:  # no depth is half way between an edge and its background
-        method = cv2.INTER_NEAREST_EXACT
+    if rgb.ndim == 3:
+        return scaled(rgb, width, height)
+    from vla_zenoh.opencv import cv2
+
+    # No depth is half way between an edge and its background.
+    method = cv2.INTER_NEAREST_EXACT
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=method))
 
 

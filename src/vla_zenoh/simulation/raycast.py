@@ -15,11 +15,11 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import cv2
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_zenoh.opencv import cv2
 from vla_zenoh.simulation.scene import MOVING_GROUP, STATIC_GROUP, box_corners
 from vla_zenoh.types import FloatArray
 

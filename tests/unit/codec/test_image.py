@@ -12,6 +12,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+import simplejpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_records import images, refusal
@@ -199,6 +200,40 @@ def test_forged_sizes_take_no_memory() -> None:
     *reasons, grown_mib = done.stdout.split()
     assert reasons == ["invalid", "malformed", "malformed"], done.stderr
     assert int(grown_mib) < 50
+
+
+def test_a_host_without_opencv_reads_and_writes_jpegs_and_names_the_extra_for_other_files() -> None:
+    script = """
+        import sys
+        sys.modules["cv2"] = None
+        import numpy as np
+        from vla_zenoh.codec import image
+        from vla_zenoh.errors import MissingExtraError
+        from vla_zenoh.types import Depth
+        given = np.frombuffer(bytes.fromhex(sys.argv[1]), np.uint8).reshape(48, 64, 3)
+        print(image.encode_jpeg(image.Image(given)).hex())
+        print(image.decode_jpeg(bytes.fromhex(sys.argv[2])).rgb.tobytes().hex())
+        try:
+            image.encode_depth(Depth(np.ones((8, 8), np.uint16), 0.001))
+        except MissingExtraError as error:
+            print(error)
+    """
+    given = [SMOOTH.rgb.tobytes().hex(), JPEG.hex()]
+    command = [sys.executable, "-c", textwrap.dedent(script), *given]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    written, read, error = done.stdout.splitlines()
+    far = image.decode_jpeg(bytes.fromhex(written)).rgb.astype(int) - SMOOTH.rgb
+    assert np.abs(far).mean() < JPEG_ERROR
+    assert bytes.fromhex(read) == image.decode_jpeg(JPEG).rgb.tobytes()
+    assert "camera" in error
+
+
+@pytest.mark.parametrize(("colours", "channels"), [("GRAY", 1), ("CMYK", 4)])
+def test_foreign_colours_are_read_as_opencv_reads_them(colours: str, channels: int) -> None:
+    pixels = np.random.default_rng(5).integers(0, 256, (16, 24, channels), dtype=np.uint8)
+    data = simplejpeg.encode_jpeg(pixels, 90, colours, "Gray" if channels == 1 else "444")
+    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(image.decode_jpeg(data).rgb, bgr[..., ::-1])
 
 
 def test_a_picture_that_nobody_would_read_is_not_written() -> None:

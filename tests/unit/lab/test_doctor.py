@@ -299,12 +299,12 @@ def test_a_camera_without_permission_names_the_group(tmp_path: Path) -> None:
 def test_a_host_needs_what_its_nodes_need() -> None:
     profile = load_profile("panda_sim_two_hosts")
     robot, gpu = needs_of(profile, "robot"), needs_of(profile, "gpu")
-    assert robot.roles == {"base", "control", "sim"}
+    assert robot.roles == {"base", "camera", "control", "sim"}
     assert robot.is_router
     assert gpu.roles == {"base"}
     assert not gpu.is_router
-    assert needs_of(profile).roles == {"base", "control", "sim"}
-    assert needs_of(load_profile("panda_ros2")).roles == {"base", "control"}
+    assert needs_of(profile).roles == {"base", "camera", "control", "sim"}
+    assert needs_of(load_profile("panda_ros2")).roles == {"base", "camera", "control"}
 
 
 def test_usb_cameras_of_a_profile_are_needed_on_the_host_that_has_them() -> None:

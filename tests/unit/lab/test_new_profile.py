@@ -6,16 +6,22 @@ from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
+from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from described_arms import SEVEN, SIX, TOOL, Row, X, Y, arm, finger, urdf
 from vla_zenoh_newarm.answers import Answers
-from vla_zenoh_newarm.gripper import gripper
+from vla_zenoh_newarm.arm import Arm, JointMotion
+from vla_zenoh_newarm.gripper import Gripper, gripper
 from vla_zenoh_newarm.mended import Mended
+from vla_zenoh_newarm.picture import outline, picture
+from vla_zenoh_newarm.posture import Posture
 from vla_zenoh_newarm.structure import structure
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.description import Description
+from vla_zenoh.kinematics.kinematics import Kinematics
 
 JOINTS_6 = tuple(f"j{n}" for n in range(1, 7))
 OPTIONS = ("base", "tcp", "home", "workspace", "table", "acceleration", "jerk", "gripper")
@@ -263,3 +269,35 @@ def test_enter_keeps_a_guess_unconfirmed_and_another_answer_confirms(
     assert person.numbers("table", (1.0,), "limits.reach.table_z_m", "", (1,)) == (1.0,)
     assert person.numbers("jerk", (1.0,), "limits.joint.jerk_rad_s3", "", (1,)) == (2.0,)
     assert [guess.place for guess in person.guesses] == ["limits.reach.table_z_m"]
+
+
+# -- the picture ----------------------------------------------------------------------------------
+def test_the_outline_of_points_leaves_out_those_inside() -> None:
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    inside = np.random.default_rng(2).uniform(0.01, 0.99, (50, 2))
+    np.testing.assert_array_equal(outline(np.concatenate([inside, square, square])), square)
+
+
+def test_the_picture_shows_every_joint_and_the_tcp_where_kinematics_has_it(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf([*arm(SIX), TOOL]))
+    links, home = structure(Description(path), None, None), (0.3, 0.5, -0.4, 0.2, 0.6, 0.1)
+    box = ((-0.5, 0.5), (-0.4, 0.4), (0.1, 0.9))
+    still = JointMotion((), (), ())
+    drawn = Arm(path, links, Gripper(), Posture(home, box, 0.6, True), still, 0.0, [], [])
+    root = ElementTree.fromstring(picture("a <b>", drawn))
+    panels = [each for each in root if each.tag.endswith("}g")]
+    tcp = Kinematics(path, "tcp", JOINTS_6, base_frame="base").forward(np.array(home)).position_m
+    for panel, (right, up) in zip(panels, ((0, 2), (0, 1), (1, 2)), strict=True):
+        joints = [each for each in panel.iter() if each.tag.endswith("}circle")]
+        assert len(joints) == len(JOINTS_6)
+        named = {each.text: each for each in panel.iter() if each.tag.endswith("}text")}
+        px = {
+            name: np.array([float(named[name].attrib[axis]) for axis in "xy"])
+            for name in ("base", "TCP")
+        }
+        workspace = panel.findall("{*}polygon")[-1].attrib["points"].split()
+        corners_px = np.array([point.split(",") for point in workspace], float)
+        px_m = np.ptp(corners_px[:, 0]) / np.ptp(box[right])
+        apart_m = (px["TCP"] - px["base"]) / (px_m, -px_m)
+        np.testing.assert_allclose(apart_m, tcp[[right, up]], atol=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -242,6 +243,26 @@ def test_a_shape_that_rerun_cannot_draw_is_named() -> None:
     shape = pin.GeometryObject("hull", 0, pin.SE3.Identity(), coal.Cone(0.1, 0.2))
     with pytest.raises(ResourceError, match=r"the shape hull \(Cone\) cannot be drawn"):
         archetype_of(shape)
+
+
+def test_a_camera_is_drawn_on_its_link_with_what_its_lens_sees(tmp_path: Path) -> None:
+    lens = {"width": 640, "height": 480, "fx_px": 500, "fy_px": 501, "cx_px": 321, "cy_px": 241}
+    (tmp_path / "lens.yaml").write_text(json.dumps(lens))
+    mount = {"frame": "eye", "link": "panda_hand", "position_m": [0.05, 0.0, 0.04]}
+    camera = {
+        "source": "file:clip.mp4",
+        "intrinsics": str(tmp_path / "lens.yaml"),
+        "crop": {"left": 100, "top": 0, "width": 320, "height": 480},
+        "width": 160,
+        "height": 240,
+        "mount": {**mount, "rpy_rad": [0.0, 0.0, 1.5708]},
+    }
+    profile = override(PROFILE, {"cameras": {"eye": camera}})
+    _, shown = heard(tmp_path, profile=profile)
+    eye = "world/robot/panda_hand/camera/eye"
+    assert {"Transform3D:translation", "Transform3D:mat3x3"} <= shown.static(eye)
+    ((matrix,),) = shown.held(f"{eye}/lens", "Pinhole:image_from_camera")
+    np.testing.assert_allclose(matrix, [250, 0, 0, 0, 250.5, 0, 110.5, 120.5, 1])
 
 
 def test_what_the_arm_keeps_out_of_is_drawn_where_it_is(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from vla_zenoh.codec import image as image_codec
@@ -176,6 +175,8 @@ class DepthColumn:
 
 
 def _metres(depth: Depth) -> bytes:
+    from vla_zenoh.opencv import cv2
+
     ok, data = cv2.imencode(".tiff", (depth.counts * depth.unit_m).astype(np.float32))
     if not ok:
         raise RecordingError(f"no TIFF could be made of {depth.counts.shape} depths")

@@ -21,6 +21,7 @@ from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.resources import PACKAGED, robot_urdf
 from vla_zenoh_newarm.answers import Answers
 from vla_zenoh_newarm.arm import Arm, found_arm, meshes_of
+from vla_zenoh_newarm.picture import picture
 from vla_zenoh_newarm.profile_text import profile_text
 
 
@@ -75,6 +76,13 @@ def new(
         list[str] | None,
         typer.Option("--set", help="Argument of a xacro as name=value; repeatable."),
     ] = None,
+    drawn: Annotated[
+        Path | None,
+        typer.Option(
+            "--picture",
+            help="SVG of the arm at home, its frames and its workspace, to compare with guesses.",
+        ),
+    ] = None,
     yes: Annotated[
         bool, typer.Option("--yes", "-y", help="Ask nothing: every guess is taken.")
     ] = False,
@@ -107,6 +115,9 @@ def new(
         path = named or os.path.relpath(arm.file.resolve(), file.resolve().parent)
         text = profile_text(name, description, path, arm)
         part.write_text(text, "utf-8")
+    if drawn is not None:
+        with output_file(drawn, force=force, inputs=[source]) as part:
+            part.write_text(picture(name, arm), "utf-8")
     _report(file, arm, as_json)
 
 

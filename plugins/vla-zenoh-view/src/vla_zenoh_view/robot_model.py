@@ -16,10 +16,11 @@ import numpy as np
 import pinocchio as pin
 import rerun as rr
 
-from vla_zenoh.errors import ResourceError, VlaZenohError
+from vla_zenoh.errors import NodeError, ResourceError, VlaZenohError
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
+from vla_zenoh.nodes.camera.geometry import Geometry
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 from vla_zenoh_view import paths
@@ -31,6 +32,8 @@ MEDIA_TYPES = {
     ".obj": "model/obj",
     ".stl": "model/stl",
 }
+CAMERA_AXIS_M, IMAGE_PLANE_M = 0.05, 0.12
+"""Axes of a camera's optical frame, and how far in front of it its image is drawn."""
 
 
 class RobotMeshes:
@@ -57,6 +60,13 @@ class RobotMeshes:
         self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
         self._shapes = _load_shapes(self.kinematics.urdf)
         links = dict.fromkeys(link for link, _, _ in self._shapes)
+        self._cameras = {
+            name: camera
+            for name, camera in profile.cameras.items()
+            if camera.mount is not None and self._model.existBodyName(camera.mount.link)
+        }
+        mounts = [camera.mount for camera in self._cameras.values()]
+        links |= dict.fromkeys(mount.link for mount in mounts if mount is not None)
         self._frames = {link: self._model.getFrameId(link, pin.FrameType.BODY) for link in links}
 
     def _index(self, joint: str) -> int:
@@ -74,6 +84,29 @@ class RobotMeshes:
             path = f"{paths.below(root, link)}/{index}"
             stream.log(path, placed, archetype_of(shape), static=True)
 
+    def log_cameras(self, stream: rr.RecordingStream, root: str) -> None:
+        """Log every camera that has a mount below its link: its axes, and what its lens sees."""
+        for name, camera in self._cameras.items():
+            assert camera.mount is not None
+            mount = camera.mount
+            path = f"{paths.below(root, mount.link)}/{paths.below(paths.CAMERA, name)}"
+            turn = rotation_from_rpy(np.array(mount.rpy_rad))
+            placed = rr.Transform3D(translation=mount.position_m, mat3x3=turn)
+            stream.log(path, placed, rr.TransformAxes3D(CAMERA_AXIS_M), static=True)
+            try:
+                lens = Geometry(camera).intrinsics()
+            except NodeError:  # a recording from another host: its file is not here
+                continue
+            if lens is None:
+                continue
+            pinhole = rr.Pinhole(
+                resolution=[lens.width, lens.height],
+                focal_length=[lens.fx_px, lens.fy_px],
+                principal_point=[lens.cx_px, lens.cy_px],
+                image_plane_distance=IMAGE_PLANE_M,
+            )
+            stream.log(f"{path}/lens", pinhole, static=True)
+
     def move(self, positions: Mapping[str, float]) -> None:
         """Set joint positions (rad, or m) by name; joints of another robot are ignored."""
         for name, value in positions.items():
@@ -86,7 +119,7 @@ class RobotMeshes:
         self.move({name: sign * position for name, sign in self._finger_signs.items()})
 
     def placements(self) -> Iterator[tuple[str, Pose]]:
-        """Every link with a shape, and its pose in the base frame."""
+        """Every link with a shape or a camera, and its pose in the base frame."""
         pin.forwardKinematics(self._model, self._data, self._q)
         base = self.kinematics.base_placement
         for link, frame in self._frames.items():
@@ -155,6 +188,7 @@ def load_robot_model(
     try:
         model = RobotMeshes(profile)
         model.log_shapes(stream, root)
+        model.log_cameras(stream, root)
         return model, ""
     except VlaZenohError as error:
         return None, str(error)

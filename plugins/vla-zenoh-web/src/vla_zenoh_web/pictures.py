@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from vla_zenoh.bus.buffers import bytes_of, header_of
@@ -140,6 +139,8 @@ def _coloured(png: bytes, encoding: str) -> tuple[bytes, str]:
     Raises:
         CodecError: it is no depth picture.
     """
+    from vla_zenoh.opencv import cv2
+
     depth = decode_depth(png, encoding.partition(";")[2])
     sparse = depth.counts[::SPARSE, ::SPARSE]
     known = sparse[sparse > 0]

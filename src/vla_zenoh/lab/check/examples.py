@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,15 +43,17 @@ def chart(height: int, width: int) -> Picture:
     ramp = (np.arange(width) * 255 // max(width - 1, 1)).astype(np.uint8)
     picture[3 * height // 4 :] = ramp[None, :, None]
     picture[: height // 8, : width // 8] = 255
-    centre, radius = (2 * width // 3, height // 3), max(2, height // 8)
-    return np.asarray(cv2.circle(picture, centre, radius, (180, 0, 90), -1), np.uint8)
+    rows, columns = np.ogrid[:height, :width]
+    apart_px = np.hypot(rows - height // 3, columns - 2 * width // 3)
+    picture[apart_px <= max(2, height // 8)] = (180, 0, 90)
+    return picture
 
 
 def noise(height: int, width: int) -> Picture:
     """Noise of a fixed seed, coarse enough to survive a resize."""
     small = np.random.default_rng(7).integers(0, 256, (12, 16, 3), dtype=np.uint8)
-    scaled = cv2.resize(small, (width, height), interpolation=cv2.INTER_NEAREST)
-    return np.asarray(scaled, np.uint8)
+    rows, columns = np.arange(height) * 12 // height, np.arange(width) * 16 // width
+    return small[rows[:, None], columns]
 
 
 def plain(value: int) -> Callable[[int, int], Picture]:

@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import typer
 
 from vla_zenoh.cli.options import JsonOption, options
@@ -17,6 +16,7 @@ from vla_zenoh.errors import MissingExtraError, VlaZenohError, in_words
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
 from vla_zenoh.nodes.camera.node import make_source
+from vla_zenoh.opencv import cv2
 from vla_zenoh.plugins import CAMERAS, CameraPlugin, FoundCamera, load_all
 from vla_zenoh.profile.schema import CameraProfile
 

@@ -22,7 +22,7 @@ from vla_zenoh.lab.doctor.software import libraries, opengl, python_version
 
 __all__ = ["HostFinding", "Level", "Needs", "Role", "examine", "needs_of"]
 
-ROLES: tuple[Role, ...] = ("base", "control", "sim")
+ROLES: tuple[Role, ...] = ("base", "camera", "control", "sim")
 
 
 def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[HostFinding]:

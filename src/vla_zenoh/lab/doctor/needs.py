@@ -33,7 +33,7 @@ def judged(
     return HostFinding(name, "ok", found) if well else HostFinding(name, level, found, advice)
 
 
-Role = Literal["base", "control", "sim"]
+Role = Literal["base", "camera", "control", "sim"]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -72,6 +72,8 @@ def needs_of(profile: Profile, host: str | None = None) -> Needs:
     hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
     nodes = nodes_on(profile, host)
     roles: set[Role] = {"base"}
+    if nodes & {"camera", "ros2"}:
+        roles.add("camera")
     if nodes & {"command", "arm", "ros2"}:
         roles.add("control")
     if "sim" in nodes:

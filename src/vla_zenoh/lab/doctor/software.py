@@ -23,15 +23,17 @@ MODULES: Mapping[Role, Mapping[str, str]] = {
         "zenoh": "eclipse-zenoh",
         "msgspec": "msgspec",
         "numpy": "numpy",
-        "cv2": "opencv-python-headless",
+        "simplejpeg": "simplejpeg",
         "pydantic": "pydantic",
         "yaml": "pyyaml",
     },
+    "camera": {"cv2": "opencv-python-headless"},
     "control": {"pinocchio": "pin", "ruckig": "ruckig"},
     "sim": {"mujoco": "mujoco-core", "av": "av"},
 }
 PURPOSE: Mapping[Role, str] = {
-    "base": "cameras and workers",
+    "base": "workers, programs that drive",
+    "camera": "cameras",
     "control": "command node",
     "sim": "simulator",
 }

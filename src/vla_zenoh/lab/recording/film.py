@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.lab.recording.sample import JPEG
 from vla_zenoh.lab.video import VideoWriter, decoded_at_height
+from vla_zenoh.opencv import cv2
 
 STRIP, TEXT = 0.085, 0.026
 """Height of the strip below the images, and of letters in it, as shares of the height."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.lab.tasks.task import STAY, TaskOutcome, is_judged
+from vla_zenoh.opencv import cv2
 from vla_zenoh.types import Image
 
 FRAME_WIDTH, FRAME_HEIGHT, TITLE_HEIGHT, GAP = 560, 420, 56, 8

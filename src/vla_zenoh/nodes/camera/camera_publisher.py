@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import OPENING, Kind
 from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics, Pixels, resize
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
+from vla_zenoh.opencv import cv2
 from vla_zenoh.policy import CameraSpec
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.profile.schema import CameraProfile

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -104,6 +103,8 @@ class Geometry:
         Raises:
             NodeError: the crop reaches beyond the image.
         """
+        from vla_zenoh.opencv import cv2
+
         height, width = image.shape[:2]
         profile, crop = self._profile, self._profile.crop
         self._size = (width, height)
@@ -146,6 +147,8 @@ class Geometry:
 
     def _undistortion(self, width: int, height: int) -> tuple[Pixels, Pixels]:
         if (width, height) not in self._maps:
+            from vla_zenoh.opencv import cv2
+
             assert self._own is not None
             lens = self._own.scaled(width, height)
             coefficients = np.array([*lens.distortion, *[0.0] * (5 - len(lens.distortion))])
@@ -161,6 +164,8 @@ _FLIPS = {"horizontal": 1, "vertical": 0, "both": -1}
 def resize(image: Pixels, width: int, height: int, *, depth: bool = False) -> Pixels:
     """Stretch to (height, width): by area averaging to shrink, linearly to enlarge, and depth by
     its nearest pixel."""
+    from vla_zenoh.opencv import cv2
+
     had_height, had_width = image.shape[:2]
     if (had_height, had_width) == (height, width):
         return image

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import NodeError
+from vla_zenoh.opencv import cv2
 from vla_zenoh.profile.schema import CameraCheck, CameraProfile
 
 ROWS, COLUMNS = 96, 128

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from vla_zenoh.nodes.camera.camera_publisher import OK, WAITING, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.nodes.camera.image_check import read_references
 from vla_zenoh.nodes.camera.source import STALL_S, Grabber, Source, prepare_opencv, without_password
+from vla_zenoh.opencv import cv2
 from vla_zenoh.policy import CameraSpec, ModelSpec
 from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import Profile

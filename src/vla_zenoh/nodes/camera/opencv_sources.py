@@ -13,12 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
-
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.camera.geometry import Pixels
 from vla_zenoh.nodes.camera.source import STALL_S, Source, without_password
 from vla_zenoh.nodes.camera.v4l2_devices import DEV, SYS, find_device
+from vla_zenoh.opencv import cv2
 from vla_zenoh.profile.schema import CameraProfile
 
 

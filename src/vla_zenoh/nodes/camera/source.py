@@ -8,11 +8,10 @@ import threading
 import time
 from abc import ABC, abstractmethod
 
-import cv2
-
 from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Intrinsics, Pixels
+from vla_zenoh.opencv import cv2
 
 LOOK_S = 0.5
 """Without subscribers one image in this time is still decoded, to detect a broken camera."""

@@ -98,6 +98,8 @@ class RobotSession:
                 self.spec.observation.cameras, streams.images.items(), strict=True
             )
         ]
+        if streams.depth:
+            import vla_zenoh.opencv  # rather than at the first depth image  # noqa: F401
         self._cameras += [
             camera_stream(name, [keys.camera_depth(name)], kept, Depth, decode_depth)
             for name, kept in streams.depth.items()
