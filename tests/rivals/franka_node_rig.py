@@ -26,6 +26,7 @@ connect = ["{endpoint}"]
 name = "fr3"
 host = "127.0.0.1"
 realtime = "ignore"
+{more}
 """
 SCRIPT = Path(__file__).with_name("franka_node_process.py")
 
@@ -63,16 +64,20 @@ class Client(FrankaProcess):
 
 
 class FrankaNode:
-    """franka-node itself, which dials `endpoint`."""
+    """franka-node itself, which dials `endpoint`; `more` is TOML of its arm."""
 
-    def __init__(self, endpoint: str, folder: Path) -> None:
+    def __init__(self, endpoint: str, folder: Path, more: str = "") -> None:
         config = folder / "franka-node.toml"
-        config.write_text(CONFIG.format(endpoint=endpoint))
+        config.write_text(CONFIG.format(endpoint=endpoint, more=more))
         environ = {**os.environ, "RUST_LOG": "debug,zenoh=warn"}
         with (folder / "franka-node.log").open("wb") as log:
             self._process = subprocess.Popen(
                 [os.environ[NODE], str(config)], stdout=log, stderr=log, env=environ
             )
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
 
     def kill(self) -> None:
         self._process.kill()

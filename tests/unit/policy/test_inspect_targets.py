@@ -21,6 +21,7 @@ def targets() -> Targets:
 
 def test_the_numbers_are_the_joints_and_the_gripper(targets: Targets) -> None:
     assert targets.labels == (*PANDA.robot.arm_joints, GRIPPER)
+    assert targets.action.kind == "absolute"
     assert np.all(targets.low < HOME - 1e-3)
     assert np.all(targets.high >= HOME)
 

@@ -46,7 +46,12 @@ class Targets:
         speed_rad_s = np.broadcast_to(given, (len(names),))
         self.most = np.array([*(SHARE * speed_rad_s / rate_hz), 1.0])
         self.action = ActionSpec(
-            horizon=1, dt_s=1 / rate_hz, space="joint", joints=names, gripper="open_fraction"
+            horizon=1,
+            dt_s=1 / rate_hz,
+            kind="absolute",
+            space="joint",
+            joints=names,
+            gripper="open_fraction",
         )
 
     def refusal(self, here: FloatArray, target: FloatArray) -> str:
