@@ -155,7 +155,8 @@ def vectors() -> Iterator[dict[str, Any]]:
     """Every vector: what it is, its bytes, and the value or the reason of its rejection."""
     for record in VALID:
         payload = records.encode(record)
-        yield _vector("record", type(record).__name__, "valid", payload, message.unpack, payload)
+        found = _vector("record", type(record).__name__, "valid", payload, message.unpack, payload)
+        yield found | ({"spec_hash": record.hash} if isinstance(record, ModelSpec) else {})
     firsts = {type(record): message.unpack(records.encode(record)) for record in reversed(VALID)}
     later = firsts[types.Task] | {"later": 1}
     task = _known(types.Task)
@@ -210,6 +211,9 @@ def schema() -> str:
     kinds = [type(record) for record in VALID if type(record) is not ModelSpec]
     structs = [form_of(kind).struct for kind in dict.fromkeys((types.Header, *kinds))]
     _, found = msgspec.json.schema_components(structs, ref_template="#/$defs/{name}")
+    header = found["Header"]  # the version of the wire is no field of the program's
+    header["properties"] = {"schema": {"const": SCHEMA}, **header["properties"]}
+    header["required"] = ["schema", *header["required"]]
     spec = ModelSpec.model_json_schema(ref_template="#/$defs/{model}")
     found |= {**spec.pop("$defs"), "ModelSpec": spec}
     whole = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$defs": found}
