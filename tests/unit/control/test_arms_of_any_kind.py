@@ -11,6 +11,7 @@ from made_arm import SLIDE_M, made_arm
 
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.errors import ProfileError
+from vla_zenoh.profile import override
 
 EXACT = 1e-6
 MIXED = "sztytzsx"
@@ -103,6 +104,21 @@ def test_a_measured_joint_that_slides_away_from_its_command_ends_the_activation(
     for _ in range(100):
         arm.tick()
     assert arm.rig.state == "inactive"
+
+
+def test_no_joint_is_faster_than_its_description_says_whatever_the_profile_allows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("made_arm.TURN_RAD_S", 0.3)
+    monkeypatch.setattr("made_arm.SLIDE_M_S", 0.05)
+    quick = {"joint": {"velocity_rad_s": [0.2, 1.0, 1.0]}, "step_rad": 0.8, "lead_rad": 1.5}
+    profile = override(made_arm(tmp_path, "sztytz"), {"limits": quick})
+    arm = Joints(profile)
+    arm.activate()
+    arm.settle(arm.joints_rad + [0.1, 0.7, 0.7], 1.2)
+    fastest = np.abs([command.velocity_rad_s for command in arm.joints]).max(axis=0)
+    assert np.all(fastest < 1.001 * arm.kinematics.velocity_rad_s)
+    assert np.all(fastest[1:] > 0.9 * arm.kinematics.velocity_rad_s[1:])
 
 
 def test_an_arm_has_sixteen_joints_at_most(tmp_path: Path) -> None:
