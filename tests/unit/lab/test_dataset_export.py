@@ -40,6 +40,7 @@ from vla_zenoh_dataset.features import (
 )
 from vla_zenoh_dataset.lerobot import export
 from vla_zenoh_dataset.openvla import openvla_statistics
+from vla_zenoh_dataset.videos import chosen
 from vla_zenoh_policy_servers.state_vector import read_parts
 
 from vla_zenoh.errors import RecordingError
@@ -171,6 +172,17 @@ def test_the_video_shows_the_newest_picture_of_each_frame(dataset: Path) -> None
             assert rgb.shape == (HEIGHT, WIDTH, 3)
             at_ms = 505 + episode * (CHUNK_MS * CHUNKS + 500) + index * 100
             assert abs(float(rgb.mean()) - 2 * (at_ms // 50)) < BRIGHTNESS
+
+
+def test_a_picture_that_was_overtaken_is_shown_for_no_frame(run_file: Path) -> None:
+    (episode, *_) = episodes_of(load_run(run_file))
+    begin_ns = episode.frames[0].stamp_ns
+    stamps_ns = [begin_ns + round(at_s * 1e9) for at_s in (0.0, 0.4, 0.2, 0.2, 0.6, 0.5, 1.0, 1.4)]
+    shown = chosen(episode, "front", stamps_ns)
+    assert shown == sorted(shown), "the video is written in the order of reception"
+    assert set(shown) == {0, 1, 4, 6, 7}
+    for number, frame in zip(shown, episode.frames, strict=True):
+        assert stamps_ns[number] <= frame.stamp_ns
 
 
 def test_info_names_and_types_what_the_spec_declares(dataset: Path) -> None:

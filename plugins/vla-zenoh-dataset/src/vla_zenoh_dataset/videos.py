@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +37,9 @@ def chosen(
     Raises:
         RecordingError: no image, or only one that is too old.
     """
-    order = sorted(range(len(stamps)), key=stamps.__getitem__)
+    # One that came after a newer one is left out, as a worker leaves it out.
+    newest = [-1, *accumulate(stamps, max)]
+    order = [index for index, stamp in enumerate(stamps) if stamp > newest[index]]
     in_time = [stamps[index] for index in order]
     out = []
     for frame in episode.frames:
