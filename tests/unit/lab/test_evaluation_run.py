@@ -40,6 +40,7 @@ from vla_zenoh.types import (
     NodeStatus,
     PoseCommand,
     PoseState,
+    SingleWriterFilter,
     Task,
 )
 
@@ -292,7 +293,8 @@ def test_a_run_that_moves_to_another_time_and_robot_keeps_its_latencies(recordin
         assert moved.header is not None
         assert moved.header.stamp_wall_ns == entry.header.stamp_wall_ns + later_ns
         assert moved.header.seq == entry.header.seq
-        assert moved.header.source == entry.header.source.split("#")[0] + "#abc"
+        node, start = entry.header.source.split("#")
+        assert moved.header.source == f"{node}#abc{start}"
         if entry.kind is PoseCommand and (cause := entry.record().cause):
             found = records.decode(PoseCommand, moved.payload).cause
             for name in Cause.__dataclass_fields__:
@@ -301,6 +303,18 @@ def test_a_run_that_moves_to_another_time_and_robot_keeps_its_latencies(recordin
         if entry.kind is ActionChunk:
             found = records.decode(ActionChunk, moved.payload)
             assert found.valid_until_ns == entry.record().valid_until_ns + later_ns
+
+
+def test_what_a_robot_sends_after_a_restart_is_no_repetition_of_what_it_sent_before() -> None:
+    restamper = Restamper(ZERO_NS, ZERO_NS, 1.0, KEYS, KEYS, "abc")
+    seen = SingleWriterFilter(sources=2)
+    for start in ("sim#first", "sim#second", f"sim#{'x' * 124}"):
+        for seq in range(3):
+            sample = Sample(KEYS.state_pose, b"", MSGPACK, Header(ZERO_NS, seq, start), ZERO_NS)
+            header = restamper.move(sample).header
+            assert header is not None
+            seen.check(header)
+            seen.accept(header)
 
 
 def test_at_twice_the_speed_everything_takes_half_the_time(recording: Path) -> None:

@@ -20,7 +20,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import alive_nodes
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import message
-from vla_zenoh.errors import CodecError, NodeError, RecordingError, in_words
+from vla_zenoh.errors import CodecError, NodeError, ProfileError, RecordingError, in_words
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.reader import Recording
 from vla_zenoh.lab.recording.record_types import group_of
@@ -31,6 +31,8 @@ from vla_zenoh.runtime.process import realtime_thread
 from vla_zenoh.types import Header
 
 STAMP = "_ns"
+MAX_SOURCE = 128
+"""Characters of a header's source."""
 
 
 class Restamper:
@@ -63,8 +65,9 @@ class Restamper:
         """The sample to publish, at the time `received_ns`."""
         header = entry.header
         if header is not None:
-            node, _, _ = header.source.partition("#")
-            source = f"{node}#{self._suffix}"
+            # Of a node that was restarted, the numbers began again.
+            node, _, start = header.source.partition("#")
+            source = f"{node}#{self._suffix}{start}"[:MAX_SOURCE]
             header = Header(self.moved_ns(header.stamp_wall_ns), header.seq, source)
         payload = entry.payload
         if entry.fields is not None:
@@ -279,9 +282,10 @@ class Replay:
         if key not in self._publishers:
             self._publishers[key] = self.node.session.declare_publisher(key, **QOS)
             camera = key.split("/")[-2]
-            if group_of(self._there, key) == CAMERAS and key == self._there.camera_jpeg(camera):
-                raw = self._there.camera_raw(camera)
-                self._raw[key] = self.node.session.declare_publisher(raw, **QOS)
+            with suppress(ProfileError):  # a name that no camera of ours has
+                if group_of(self._there, key) == CAMERAS and key == self._there.camera_jpeg(camera):
+                    raw = self._there.camera_raw(camera)
+                    self._raw[key] = self.node.session.declare_publisher(raw, **QOS)
         return self._publishers[key]
 
     # -- writing ------------------------------------------------------------------------------
