@@ -136,3 +136,17 @@ def test_a_recorder_that_cannot_subscribe_leaves_the_bus_and_closes_its_file(
     file = open_recording(path)
     list(file.entries())
     assert file.ended == {"dropped": {}, "lost": {}}
+
+
+def test_whatever_ends_the_writing_ends_the_recording_with_its_reason(
+    profile: Profile, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any) -> None:
+        raise KeyError("a fault that nobody thought of")
+
+    recorder = Recorder(profile, session, tmp_path / "run.mcap")
+    monkeypatch.setattr(RecordingWriter, "commit", broken)
+    recorded = recorder.run(threading.Event(), PATIENCE_S)
+    assert "a fault that nobody thought of" in recorded.failure
+    assert recorded.seconds < PATIENCE_S
+    await_gone(session, profile)

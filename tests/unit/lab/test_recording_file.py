@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -10,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ from vla_zenoh.codec.image import encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.keys import SCHEMA, Keys
 from vla_zenoh.lab.recording.reader import open_recording
+from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample, received_sample
 from vla_zenoh.lab.recording.writer import RecordingWriter, topic_of
 from vla_zenoh.policy import ModelSpec
@@ -162,6 +165,20 @@ def test_a_header_that_fits_into_no_message_is_kept(tmp_path: Path) -> None:
         (far, put.payload),
         (nameless.header, nameless.payload),
     ]
+
+
+def test_no_key_of_another_program_ends_the_writing_or_the_reading(tmp_path: Path) -> None:
+    ours = (KEYS.camera_jpeg("front"), KEYS.state_pose, KEYS.delta("scripted"), KEYS.seen("a", "b"))
+    parts = [each.split("/") for each in ours]
+    cut = {"/".join(words[:end]) for words in parts for end in range(1, len(words))}
+    cut |= {"/".join(words[at:]) for words in parts for at in range(1, len(words))}
+    cut |= {"/".join([*words[:3], "front left", *words[4:]]) for words in parts}
+    like = (picture(), pose(), chunk(), prompt("hold"))
+    put = [replace(sample, key=key) for key in sorted(cut) for sample in like]
+    path = written(tmp_path / "a.mcap", *put, pose())
+    found = [(each.key, each.payload) for each in open_recording(path).entries()]
+    assert sorted(found) == sorted((each.key, each.payload) for each in (*put, pose()))
+    assert len(load_run(path).poses) == 1
 
 
 def test_a_recording_of_another_version_of_the_wire_is_rejected_by_name(tmp_path: Path) -> None:
@@ -439,6 +456,19 @@ def test_a_full_disk_leaves_a_file_that_any_tool_opens(tmp_path: Path) -> None:
     assert path.stat().st_size > 0.5 * FILE_LIMIT_BYTES
     assert readable_anywhere(path) > 20
     assert open_recording(path).damage == ""
+
+
+def test_a_disk_that_is_gone_is_named_as_a_full_one_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(*_: Any) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+    out = writer(tmp_path / "a.mcap")
+    out.write(pose())
+    monkeypatch.setattr(os, "pwrite", gone)
+    with pytest.raises(RecordingError, match="Input/output error; what was recorded until then"):
+        out.commit()
 
 
 def test_a_disk_that_is_full_at_the_end_costs_the_index_alone(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.reception import Share
 from vla_zenoh.bus.session import covers
-from vla_zenoh.errors import NodeError, RecordingError
+from vla_zenoh.errors import in_words
 from vla_zenoh.keys import ENDED, Keys
 from vla_zenoh.lab.recording.sample import TEXT
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
@@ -210,10 +210,11 @@ class Recorder:
             self._count_lost()
             facts = {"dropped": dict(self.recorded.dropped), "lost": dict(self.recorded.lost)}
             self._writer.finish({**facts, **self._ended})
-        except (RecordingError, NodeError) as error:
-            self._fail(str(error))
+        except Exception as error:  # whatever it is, nothing is recorded any more
+            self._fail(in_words(error))
         self._measure()
-        self.recorded.size_bytes = self.recorded.path.stat().st_size
+        with suppress(OSError):  # it was removed
+            self.recorded.size_bytes = self.recorded.path.stat().st_size
         self._report(FAILED if self.recorded.failure else ENDED, now=True)
 
     def _write_until_closed(self) -> None:

@@ -320,18 +320,21 @@ def _of_interest(keys: Keys) -> Callable[[str], bool]:
 
     def wanted(key: str) -> bool:
         group = group_of(keys, key)
-        if group == "camera":
-            camera = _camera(keys, key)
-            return key in (keys.camera_jpeg(camera), keys.camera_depth(camera))
-        if group == "seen":
-            return key == keys.seen_record(last_chunk(key))
+        try:
+            if group == "camera":
+                camera = _camera(keys, key)
+                return key in (keys.camera_jpeg(camera), keys.camera_depth(camera))
+            if group == "seen":
+                return key == keys.seen_record(last_chunk(key))
+        except ProfileError:  # of another program: a name that none of ours has
+            return False
         return bool(group)
 
     return wanted
 
 
 def _camera(keys: Keys, key: str) -> str:
-    return keys.short(key).split("/")[1]
+    return keys.short(key).partition("/")[2].partition("/")[0]
 
 
 def pictures(file: Recording, camera: str) -> Iterator[RecordedImage]:

@@ -105,9 +105,9 @@ class CrashSafeFile:
         try:
             self._put(data if last else data + END)
         except OSError as error:
-            self._put_end_again()
+            until_then = "is whole" if self._put_end_again() else "may lack its end"
             raise RecordingError(
-                f"{self._path}: {error.strerror}; what was recorded until then is whole "
+                f"{self._path}: {error.strerror}; what was recorded until then {until_then} "
                 f"({self.size / 1e6:.1f} MB)"
             ) from error
         self._done += len(data) - (len(END) if last else 0)
@@ -117,10 +117,16 @@ class CrashSafeFile:
         while written < len(data):
             written += os.pwrite(self._file, data[written:], self._done + written)
 
-    def _put_end_again(self) -> None:
-        if self._done:  # the bytes were there before: no room is needed
-            os.pwrite(self._file, END, self._done)
-            os.ftruncate(self._file, self._done + len(END))
+    def _put_end_again(self) -> bool:
+        """Whether the file ends as after the last `commit`: a disk that is gone takes nothing, nor
+        does a full one that writes no byte in place."""
+        try:
+            if self._done:  # the bytes were there before: mostly no room is needed
+                os.pwrite(self._file, END, self._done)
+                os.ftruncate(self._file, self._done + len(END))
+        except OSError:
+            return False
+        return True
 
     def close(self) -> None:
         """Close the file; bytes since the last `commit` are lost. Closing twice does nothing."""
@@ -334,4 +340,4 @@ class RecordingWriter:
 
 
 def _camera(key: str) -> str:
-    return key.split("/")[-2]
+    return "/".join(key.split("/")[-2:-1])
