@@ -41,7 +41,8 @@ def main(name: str, direction: str, count: int) -> None:
                 reasons.append(str(error))
                 return False
 
-        client.wait_for(lambda: client.status("command"), READY_PATIENCE_S)
+        # Not by a status: `up` publishes one in the name of a node that is still starting.
+        client.wait_for(lambda: "command" in client.alive and client.task, READY_PATIENCE_S)
 
         def begin() -> FloatArray:
             client.set_prompt("hold")

@@ -65,7 +65,6 @@ def test_doctor_finds_nothing_wrong_on_a_host_of_the_lab(site: Site) -> None:
     words = ("doctor", "--profile", str(site.profile("gpu")), "--host", "gpu", "--json")
     found = {one["name"]: one for one in json.loads(site.vla("gpu", *words))}
     assert found["certificates of gpu"]["level"] == "ok"
-    assert found["access worker-scripted@gpu"]["level"] == "ok"
     assert found["router takes worker-scripted@gpu"]["level"] == "ok"
 
 
