@@ -24,7 +24,7 @@ AT_THE_END := --last-failed --last-failed-no-failures none --reruns 0 -r fEs
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long slow fuzz fuzz-motion mutants soak test-ros2 test-franka test-rivals demo-rivals test-clients test-realsense test-models check format bench flywheel bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
+.PHONY: help setup demo test test-computed test-realtime test-long slow fuzz fuzz-motion mutants soak test-ros2 test-franka test-rivals demo-rivals test-clients test-realsense test-models check format bench flywheel bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -43,16 +43,23 @@ $(DEMO_READY): pyproject.toml constraints.txt scripts/bootstrap.py $(wildcard pl
 demo: $(if $(wildcard $(READY)),$(READY),$(DEMO_READY)) ## Simulator, model and command node at work, no GPU needed
 	$(BIN)/vla-zenoh demo $(ARGS)
 
-# Files that depend on time run one at a time, two where there are four cores or more: one robot with its camera, model and
-# router keeps two cores busy. Of the rest run as many as there are cores, in order of the folders: the long
-# files of tests/sim are not the last ones. A process of theirs that dies ends the run: whoever is to take its place waits
-# for its files for ever. 5 is pytest's word for "none of these".
-AT_ONCE := $(shell $(PYTHON) -c 'import os; print(1 if os.cpu_count() < 4 else 2)')
+# Tests in real time mostly wait. Those that compute run beside them and give way to them, so that both are over in the time
+# of one; each shows what it has to say when it is over. In real time run three files at once, of which one, with four cores
+# two, are of whole robots (conftest.py); of the rest as many as there are cores, in order of the folders: the long files of
+# tests/sim are not the last ones. A process of theirs that dies ends the run: whoever is to take its place waits for its
+# files for ever. 5 is pytest's word for "none of these".
 FILES := --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
+REALTIME := -o cache_dir=.pytest_cache/realtime -m "$(SUITE) and $(WHICH) and realtime" $(ARGS)
+AT_THE_END_OF_EACH := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 test: $(READY) ## Run the tests that take up to six seconds each
-	$(BIN)/python -m pytest -n auto $(FILES) -m "$(SUITE) and $(WHICH) and not realtime" $(ARGS) || [ $$? = 5 ]
-	$(BIN)/python -m pytest -n $(AT_ONCE) $(FILES) $(AGAIN) -m "$(SUITE) and $(WHICH) and realtime" $(ARGS) || [ $$? = 5 ] || \
-		$(BIN)/python -m pytest $(AT_THE_END) -m "$(SUITE) and $(WHICH) and realtime" $(ARGS)
+	@$(MAKE) --no-print-directory --keep-going --jobs 2 $(AT_THE_END_OF_EACH) test-realtime test-computed
+
+test-computed: $(READY)
+	nice -n 10 $(BIN)/python -m pytest -n auto $(FILES) -m "$(SUITE) and $(WHICH) and not realtime" $(ARGS) || [ $$? = 5 ]
+
+test-realtime: $(READY)
+	$(BIN)/python -m pytest -n 3 $(FILES) $(AGAIN) $(REALTIME) || [ $$? = 5 ] || \
+		$(BIN)/python -m pytest $(AT_THE_END) $(REALTIME)
 
 test-long: $(READY) ## Run those that take longer, too, and the files of many whole robots
 	@$(MAKE) --no-print-directory test WHICH=long

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
@@ -24,6 +25,8 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 IN_REAL_TIME = {"wire", "fault", "netns", "ros2"}
 """Folders of tests that begin processes and wait for them: one file at a time on two cores."""
+WHOLE_ROBOTS = {"wire", "fault"}
+"""Of these, those with files of whole robots: one runs at a time, one of each with four cores."""
 KEEPS = "wire"
 """Folder whose files hand a robot on to each other; those that kill its nodes begin with a new
 one."""
@@ -48,6 +51,31 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     mark = LEFT_OUT.get(collection_path.name)
     within = collection_path.parent.name in ("tests", "reliability")
     return True if within and mark and f"not {mark}" in config.option.markexpr else None
+
+
+@pytest.hookimpl(optionalhook=True)  # of xdist
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """By file, but all those of whole robots to one worker: the others run beside them."""
+    if config.option.dist != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByFile(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            folder = file.split("/")[1]
+            if folder not in WHOLE_ROBOTS:
+                return file
+            return folder if (os.cpu_count() or 1) >= 4 else "all folders"
+
+    return ByFile(config, log)
+
+
+def pytest_collection_finish() -> None:
+    if "vla_zenoh.kinematics.collision" in sys.modules:
+        from collision_once import remember_distances
+
+        remember_distances()
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses

@@ -58,8 +58,6 @@ class Turns:
     wall_ns: int = 10**18
     seq: int = 0
     moved_s: float = 0.0
-    ramp_s: float = RAMP_S
-    """How long the motion takes to its full speed, within the profile's limits."""
 
     def joint_states(self, velocity: float = 0.0) -> None:
         fields: dict[str, Any] = {
@@ -96,7 +94,7 @@ class Turns:
     def up(self, *, moves: bool = True) -> None:
         """A command upwards from home, `moved_s` after it began at rest."""
         self.moved_s += TICK_S * moves
-        begun_s, turn_1_s = min(self.moved_s, self.ramp_s), np.pi / self.ramp_s
+        begun_s, turn_1_s = min(self.moved_s, RAMP_S), np.pi / RAMP_S
         speed = SPEED_M_S * (1 - np.cos(turn_1_s * begun_s)) / 2
         ramp_m = SPEED_M_S * (begun_s - np.sin(turn_1_s * begun_s) / turn_1_s) / 2
         way_m = ramp_m + SPEED_M_S * (self.moved_s - begun_s)
@@ -120,9 +118,6 @@ class Turns:
     @property
     def steps_m(self) -> FloatArray:
         return np.diff(self.heights_m)
-
-    def told(self, what: str) -> list[Event]:
-        return [event for event in self.states[Event] if event.what == what]
 
     def newest(self, kind: type) -> Any:
         return self.states[kind][-1]

@@ -29,7 +29,6 @@ from vla_zenoh.policy import (
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import JointLimits, Limits, load_profile, override
 
-pytestmark = pytest.mark.realtime
 ROOT = Path(__file__).parents[2]
 BROKEN = Path(__file__).with_name("broken_worker.py")
 RUNS = 40

@@ -125,16 +125,6 @@ def test_a_record_is_written_as_a_map_of_its_fields(kind: type, data: st.DataObj
 @by_kind
 @given(data=st.data())
 @NOTHING_TAKEN
-def test_one_record_after_another_comes_back_as_it_was(kind: type, data: st.DataObject) -> None:
-    pair = [data.draw(RECORDS[kind]) for _ in range(2)]
-    for record in (*pair, *pair, pair[1]):
-        back = records.decode(kind, records.encode(record))
-        assert back == record if kind is ModelSpec else near(record, back)
-
-
-@by_kind
-@given(data=st.data())
-@NOTHING_TAKEN
 def test_what_is_read_cannot_be_written_to(kind: type, data: st.DataObject) -> None:
     back = records.decode(kind, records.encode(data.draw(RECORDS[kind])))
     fields = list(type(back).model_fields if kind is ModelSpec else back.__dataclass_fields__)
@@ -145,17 +135,6 @@ def test_what_is_read_cannot_be_written_to(kind: type, data: st.DataObject) -> N
             assert value.flags.c_contiguous
         with pytest.raises((dataclasses.FrozenInstanceError, ValueError)):
             setattr(back, name, value)
-
-
-def test_what_was_written_before_makes_no_difference() -> None:
-    pose = PoseState(np.arange(3.0), np.array([0.0, 0.0, 0.0, 1.0]), np.ones(6), None)
-    wrench = dataclasses.replace(pose, wrench=np.arange(6.0))
-    shut, whole = GripperState(0.0, True, False), GripperState(0.01, False, False, "braking")
-    joints = JointState(("a", "b"), np.ones(2), np.zeros(2), None)
-    more = JointState(("a", "b", "c"), np.ones(3), np.zeros(3), np.ones(3))
-    for record in (pose, wrench, pose, shut, whole, shut, joints, more, joints, pose):
-        assert message.unpack(records.encode(record)) == as_map(record)
-        assert same(records.decode(type(record), records.encode(record)), record)
 
 
 @by_kind
@@ -313,33 +292,15 @@ HEADER_REASONS = {"schema", "invalid", "malformed"}
         ),
         (OBJECTS, {"position_m": np.zeros((2, 3))}, "position_m has 2 rows, allowed: one for each"),
         (OBJECTS, {"quat_xyzw": np.ones((1, 4))}, r"quat_xyzw\[0\] has norm 2"),
+        (JOINTS, {"effort_nm": [-np.inf, 0]}, r"effort_nm\[0\] is -inf"),
+        (COMMAND, {"goal_quat_xyzw": [1, 1, 1, 1]}, "goal_quat_xyzw has norm 2"),
+        (JOINT_COMMAND, {"velocity_rad_s": [0, np.inf]}, r"velocity_rad_s\[1\] is inf"),
     ],
 )
 def test_a_wrong_value_is_refused_by_name(record: Any, fields: Any, said: str) -> None:
     with pytest.raises(CodecError, match=said) as caught:
         records.decode(type(record), forged(record, **fields))
     assert caught.value.reason == "invalid"
-
-
-@pytest.mark.parametrize(
-    ("record", "name", "wrong", "said"),
-    [
-        (POSE, "position_m", [0, 0, np.nan], r"position_m\[2\] is nan"),
-        (POSE, "quat_xyzw", [0, 0, 0, 0.9], "quat_xyzw has norm 0.9"),
-        (JOINTS, "effort_nm", [-np.inf, 0], r"effort_nm\[0\] is -inf"),
-        (COMMAND, "goal_quat_xyzw", [1, 1, 1, 1], "goal_quat_xyzw has norm 2"),
-        (JOINT_COMMAND, "velocity_rad_s", [0, np.inf], r"velocity_rad_s\[1\] is inf"),
-    ],
-)
-def test_a_wrong_number_in_a_stream_is_refused_by_name(
-    record: Any, name: str, wrong: Any, said: str
-) -> None:
-    records.decode(type(record), records.encode(record))
-    for _ in range(2):
-        with pytest.raises(CodecError, match=said) as caught:
-            records.decode(type(record), forged(record, **{name: np.array(wrong, float)}))
-        assert caught.value.reason == "invalid"
-    assert near(record, records.decode(type(record), records.encode(record)))
 
 
 def test_numbers_of_any_kind_are_read_where_they_fit() -> None:
@@ -401,20 +362,15 @@ def invalid_values(value: Any) -> list[Any]:
 @by_kind
 @given(data=st.data())
 @settings(max_examples=4, suppress_health_check=[HealthCheck.too_slow])
-def test_an_invalid_value_is_rejected_at_the_tenth_decode_as_at_the_first(
-    kind: type, data: st.DataObject
-) -> None:
+def test_an_invalid_value_of_any_field_is_rejected(kind: type, data: st.DataObject) -> None:
     if kind is ModelSpec:
         return  # a model of Pydantic, which has no fields that bytes are not valid for
     record = data.draw(RECORDS[kind])
-    good = records.encode(record)
-    fields = message.unpack(good)
+    fields = message.unpack(records.encode(record))
     for name, value in fields.items():
         for wrong in invalid_values(value):
             bad = message.pack(fields | {name: wrong})
-            for _ in range(DECODES):
-                assert refusal(records.decode, kind, bad) is not None, (name, wrong)
-                assert near(record, records.decode(kind, good))
+            assert refusal(records.decode, kind, bad) is not None, (name, wrong)
 
 
 def test_a_record_is_checked_when_it_is_built_as_when_it_is_read() -> None:

@@ -1,4 +1,4 @@
-"""The robot's side of the joint stream: what is followed, what is refused, what silence does."""
+"""The robot's side of the joint stream, where it differs from poses (test_pose_guard.py)."""
 
 from __future__ import annotations
 
@@ -93,15 +93,6 @@ def still(position_rad: FloatArray) -> JointReference:
 
 
 # -- following --------------------------------------------------------------------------------
-def test_nobody_commands_and_it_stands() -> None:
-    guard = make_guard()
-    motion = guard.tick(START_NS)
-    assert np.array_equal(motion.position_rad, HOME_RAD)
-    assert not np.any(motion.velocity_rad_s)
-    assert not guard.following
-    assert not guard.braking
-
-
 def test_between_two_commands_the_path_goes_on() -> None:
     guard = make_guard()
     for now_ns, motion in streamed(guard, 3.0):
@@ -109,19 +100,6 @@ def test_between_two_commands_the_path_goes_on() -> None:
         np.testing.assert_allclose(motion.position_rad, true.position_rad, atol=PATH_ATOL_RAD)
     assert guard.following
     assert guard.silences == 0
-
-
-def test_a_command_that_was_held_up_meets_the_path_its_predecessors_foretold() -> None:
-    guard, now_ns = in_motion()
-    late_ns = 8 * TICK_NS
-    for tick in range(1, 9):
-        guard.tick(now_ns + tick * TICK_NS)
-    stamp_s = (now_ns + TICK_NS - START_NS) / 1e9
-    late = stamped(swing(stamp_s), 10_000, now_ns + TICK_NS, late_ns=late_ns)
-    assert guard.offer(late, now_ns + 9 * TICK_NS) is None
-    motion = guard.tick(now_ns + 9 * TICK_NS)
-    true = swing(stamp_s + late_ns / 1e9)
-    np.testing.assert_allclose(motion.position_rad, true.position_rad, atol=PATH_ATOL_RAD)
 
 
 def test_joints_in_another_order_are_put_in_the_arms() -> None:
@@ -212,26 +190,6 @@ def test_a_stream_that_goes_on_after_the_robots_own_brake_makes_no_step(
     assert guard.silences == 1
 
 
-@pytest.mark.parametrize("asleep_ms", [12, 60, 95])
-def test_a_side_that_was_woken_late_goes_on_from_what_it_sent_last(asleep_ms: int) -> None:
-    guard, now_ns = in_motion()
-    sent = guard.motion
-    now_ns += (1 + asleep_ms) * TICK_NS
-    guard.offer(stamped(swing((now_ns - START_NS) / 1e9), 10_000, now_ns), now_ns)
-    step = guard.tick(now_ns).position_rad - sent.position_rad
-    np.testing.assert_allclose(step, sent.velocity_rad_s * TICK_S, atol=STEP_RAD)
-
-
-def test_a_side_that_slept_too_long_stands_where_it_sent_the_arm_last() -> None:
-    guard, now_ns = in_motion()
-    sent = guard.motion
-    guard.hold()
-    motion = guard.tick(now_ns + 10**10)
-    np.testing.assert_array_equal(motion.position_rad, sent.position_rad)
-    assert not motion.velocity_rad_s.any()
-    assert refusal(guard, now_ns, swing(0.8)) == "too_fast"
-
-
 @pytest.mark.parametrize("joint", range(7))
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_joint_that_would_be_faster_than_its_own_limit_is_refused(joint: int, order: int) -> None:
@@ -263,21 +221,6 @@ def test_a_joint_stays_within_its_range(end: float) -> None:
     further = outside.copy()
     further[3] += end * 0.01
     assert refusal(guard, START_NS, still(further)) == "out_of_range"
-
-
-def test_while_one_is_followed_another_is_foreign() -> None:
-    guard, now_ns = in_motion()
-    here = guard.motion
-    assert refusal(guard, now_ns, here, source="command#2") == "foreign"
-    assert guard.offer(stamped(here, 10_000, now_ns), now_ns) is None
-
-
-def test_a_command_is_taken_once_and_in_order() -> None:
-    guard, now_ns = in_motion()
-    here = guard.motion
-    assert guard.offer(stamped(here, 20_000, now_ns), now_ns) is None
-    for seq in (20_000, 19_999, 0):
-        assert guard.offer(stamped(here, seq, now_ns), now_ns) == "replayed"
 
 
 def test_a_refused_command_changes_nothing() -> None:
@@ -341,27 +284,6 @@ def test_each_joint_stops_by_itself() -> None:
 def test_a_stop_that_cannot_be_planned_is_none() -> None:
     broken = JointReference(HOME_RAD, np.full(7, np.nan), np.zeros(7))
     assert stop_from(broken, BRAKE) is None
-
-
-def test_while_it_brakes_it_obeys_nobody_and_then_again() -> None:
-    guard, now_ns = in_motion()
-    silence(guard, now_ns, TIMEOUT_S + 0.02)
-    assert guard.braking
-    assert refusal(guard, now_ns, guard.motion) == "braking"
-    silence(guard, now_ns + 120 * TICK_NS, 2.0)
-    later_ns = now_ns + 3_000 * TICK_NS
-    resumed = stamped(still(guard.motion.position_rad), 10_001, later_ns)
-    assert guard.offer(resumed, later_ns) is None
-    assert guard.following
-
-
-def test_a_stream_that_ends_at_rest_has_ended_on_purpose() -> None:
-    guard = make_guard()
-    assert guard.offer(stamped(still(HOME_RAD), 0, START_NS), START_NS) is None
-    path = silence(guard, START_NS, 0.5)
-    assert guard.silences == 0
-    assert all(np.array_equal(motion.position_rad, HOME_RAD) for motion in path)
-    assert not guard.following
 
 
 def test_a_clock_that_jumps_during_the_brake_moves_nothing() -> None:

@@ -203,6 +203,11 @@ def turns(
         turns.node._close()
 
 
+def stand_still(turns: Turns, stall_s: float) -> None:
+    turns.mono_ns += round(stall_s * 1e9)
+    turns.stall_s = stall_s
+
+
 def braked(turns: Turns) -> None:
     """The motion was led to rest, and not cut."""
     full_rad = SPEED_RAD_S * TICK_S
@@ -284,8 +289,7 @@ def test_after_a_brief_stall_the_arm_is_given_its_last_set_point_at_rest_and_no_
 
     def stall() -> None:
         assert turns.arm.velocity_rad_s[JOINT] > 0.9 * SPEED_RAD_S
-        turns.mono_ns += round(stall_s * 1e9)
-        turns.stall_s = stall_s
+        stand_still(turns, stall_s)
 
     turns.script[MOVING] = stall
     turns.last = MOVING + 50
@@ -314,7 +318,8 @@ def test_an_arm_that_cannot_be_moved_any_more_is_given_up_and_that_is_told(turns
     with pytest.raises(NodeError, match="move"):
         turns.run()
     assert turns.arm.tried - len(turns.arm.moves) == 1 + FAILURES
-    assert turns.told("not_braked")
+    (event,) = turns.told("not_braked")
+    assert event.why.startswith("it cannot be braked: ")
 
 
 def test_a_read_that_raises_brakes_the_arm(turns: Turns) -> None:
@@ -324,17 +329,40 @@ def test_a_read_that_raises_brakes_the_arm(turns: Turns) -> None:
     braked(turns)
 
 
-def test_what_breaks_in_the_loop_itself_brakes_the_arm(
-    turns: Turns, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def breaks(turns: Turns, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Raises something in the loop from now on."""
+
     def unforeseen() -> None:
         raise RuntimeError("unforeseen")
 
-    turns.script[MOVING] = lambda: monkeypatch.setattr(turns.node, "_watch", unforeseen)
+    return lambda: monkeypatch.setattr(turns.node, "_watch", unforeseen)
+
+
+def test_what_breaks_in_the_loop_itself_brakes_the_arm(
+    turns: Turns, breaks: Callable[[], None]
+) -> None:
+    turns.script[MOVING] = breaks
     with pytest.raises(RuntimeError, match="unforeseen"):
         turns.run()
     braked(turns)
-    assert turns.told("broken")
+    assert np.abs(np.diff(turns.steps_rad)).max() < JERKED_RAD
+    (event,) = turns.told("broken")
+    assert event.why.endswith(": braked, and ends")
+    assert not turns.told("not_braked")
+
+
+def test_an_arm_that_stood_while_the_loop_did_is_not_moved_again_by_its_brake(
+    turns: Turns, breaks: Callable[[], None]
+) -> None:
+    turns.script[MOVING] = breaks
+    turns.script[MOVING + 1] = lambda: stand_still(turns, 0.2)
+    with pytest.raises(RuntimeError, match="unforeseen"):
+        turns.run()
+    assert turns.node.arm is not None
+    assert turns.node.arm.stalls == 1
+    assert len(turns.arm.moves) == MOVING + 2, "after that in which it broke, once more at rest"
+    assert turns.steps_rad[-1] == 0.0
 
 
 # -- what is read -----------------------------------------------------------------------------

@@ -30,6 +30,8 @@ STILL_SCENE_S = 6
 RATE_TOLERANCE = 0.1
 COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "skin": (224, 172, 105)}
 
+pytestmark = pytest.mark.realtime
+
 
 def colour_chart(width: int = 64, height: int = 48) -> np.ndarray:
     """Four vertical stripes, RGB."""

@@ -33,6 +33,8 @@ TOKENS = 300
 MAX_SEEN = 5
 SURELY = zenoh.CongestionControl.BLOCK
 
+pytestmark = pytest.mark.realtime
+
 
 def own_profile() -> Profile:
     endpoint = free_endpoint()

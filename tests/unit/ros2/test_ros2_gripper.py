@@ -43,6 +43,8 @@ ENDS = {"GripperCommand": {"stalled": True}}
 """How the robot's actions end."""
 ORDER = GripperCommand(0.02, 0.05, 10.0)
 
+pytestmark = pytest.mark.realtime
+
 
 class Rig:
     """A gripper that is turned by hand, and the robot's side of its action."""

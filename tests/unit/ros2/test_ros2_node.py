@@ -41,6 +41,7 @@ MOVE = "/panda_gripper/move/_action"
 GOAL = "multi_mode_control_msgs/msg/CartesianImpedanceGoal"
 BRIDGES = ("ros2dds", "rmw_zenoh")
 
+pytestmark = pytest.mark.realtime
 
 whatever_the_bridge = pytest.mark.parametrize("shared_rig", BRIDGES[:1], indirect=True)
 """Of a test about what the node makes of messages, however they came."""
