@@ -47,10 +47,15 @@ def pytest_configure() -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Do not even import a folder that -m leaves out: that takes as long as many tests."""
+    """Do not even import what -m leaves out: that takes as long as many tests."""
+    chosen = config.option.markexpr
+    if chosen.endswith("and realtime") and collection_path.suffix == ".py":
+        folder = collection_path.relative_to(ROOT).parts[1]
+        if folder not in IN_REAL_TIME and "realtime" not in collection_path.read_text("utf-8"):
+            return True
     mark = LEFT_OUT.get(collection_path.name)
     within = collection_path.parent.name in ("tests", "reliability")
-    return True if within and mark and f"not {mark}" in config.option.markexpr else None
+    return True if within and mark and f"not {mark}" in chosen else None
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist

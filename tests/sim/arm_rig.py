@@ -44,6 +44,14 @@ WOBBLE_FACTOR = 2.0
 TICK_S = 1 / 250
 STARTED_S = 0.7
 """From standing to the speed that is asked for; it is steady later."""
+STARVED = 0.30, 0.045
+"""Seconds until the arm stands, and metres until then, at most. From the last good chunk: a period,
+the watchdog (less the period begun) and the brake."""
+BRAKE, OWN, LOST = (0.20, 0.021), (0.15, 0.015), (0.40, 0.060)
+FROZEN = 0.50, 0.085
+"""The command runs `tracking_m` ahead of a measured pose that stands still, then the brake."""
+SILENT = 0.25, 0.035
+"""The stream of commands times out, then the robot's own brake."""
 READY_S = 0.2
 """Until every node has heard of the others."""
 
@@ -125,7 +133,7 @@ def begin(
     return loop
 
 
-def moving(seconds: float = 1.4, prompt: str = UP, rate_hz: float = RATE_HZ) -> Lockstep:
+def moving(seconds: float = 1.0, prompt: str = UP, rate_hz: float = RATE_HZ) -> Lockstep:
     """A loop whose arm is in full motion."""
     loop = begin(prompt, rate_hz)
     loop.run(seconds)
@@ -181,6 +189,20 @@ def way_m(loop: Lockstep, since: int) -> float:
     """How far the measured TCP got from where it was at `since`, at most."""
     path = path_m(loop)
     return float(np.linalg.norm(path[since:] - path[since - 1], axis=1).max())
+
+
+def check_stop(loop: Lockstep, since: int, within: tuple[float, float]) -> None:
+    """It stood within so many seconds and metres of `since`."""
+    stop_s, stop_m = within
+    assert stop_time_s(loop, since) < stop_s
+    assert way_m(loop, since) < stop_m
+
+
+def goes_on(loop: Lockstep) -> None:
+    """Activated again it moves from where it is, without a jump."""
+    activate(loop)
+    loop.run(0.6)
+    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
 
 
 def check_motion(
@@ -278,6 +300,44 @@ def with_fields(sent: Message, **fields: Any) -> Message:
 def changed(kind: type, **fields: Any) -> Tamper:
     """Messages of this kind have other fields in their payload."""
     return lambda sent: [with_fields(sent, **fields) if sent.kind is kind else sent]
+
+
+def early(sent: Message) -> Iterable[Message]:
+    """A chunk that is stamped 0.2 s from now."""
+    if sent.kind is not ActionChunk:
+        return [sent]
+    data, ahead_ns = message.unpack(sent.payload), 200_000_000
+    stamps = {name: data[name] + ahead_ns for name in ("observation_stamp_ns", "valid_until_ns")}
+    header = replace(sent.header, stamp_wall_ns=sent.header.stamp_wall_ns + ahead_ns)
+    return [with_fields(replace(sent, header=header), **stamps)]
+
+
+def spoilt(kind: type, name: str) -> Tamper:
+    """One number of this field is not one."""
+
+    def tamper(sent: Message) -> Iterable[Message]:
+        if sent.kind is not kind:
+            return [sent]
+        value = np.array(message.unpack(sent.payload)[name])
+        value.reshape(-1)[-1] = [np.nan, np.inf, -np.inf][sent.header.seq % 3]
+        return [with_fields(sent, **{name: value})]
+
+    return tamper
+
+
+def frozen(*kinds: type, payload_only: bool) -> Tamper:
+    """The first message of each kind is sent again and again; `payload_only`: as a new one."""
+    kept: dict[type, Message] = {}
+
+    def tamper(sent: Message) -> Iterable[Message]:
+        if sent.kind not in kinds:
+            return [sent]
+        first = kept.setdefault(sent.kind, sent)
+        if payload_only:
+            return [replace(sent, payload=first.payload)]
+        return [replace(first, arrival_ns=sent.arrival_ns)]
+
+    return tamper
 
 
 def chunks_only(change: Callable[[Message], Iterable[Message]]) -> Tamper:

@@ -58,7 +58,7 @@ def test_the_benchmark_has_as_many_paths_as_it_says() -> None:
     assert sum(case.name == "random" and case.way == "joints" for case in cases) == 50
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["swivel", "wrist", "random"])
 def test_joints_of_the_panda_rest_where_they_were_asked_to(name: str) -> None:
     found = carried_out(name, PANDA, "joints")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from arm_rig import (
+    BRAKE,
     HOLD,
     SPEED_M_S,
     STARTED_S,
@@ -20,6 +21,7 @@ from arm_rig import (
     begin,
     changed,
     check_motion,
+    check_stop,
     dropped,
     mark,
     moving,
@@ -34,7 +36,6 @@ from vla_zenoh_benchmarks.lockstep.worker import Message
 from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseReference, PoseState
 
 EXACT_M = 1e-3
-BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.021
 SLIP_M = 1e-3
 TOGGLES_S = 5.0
 MOVES_M_S, TOGGLED_WAY_M = 0.02, 0.3
@@ -102,11 +103,10 @@ def test_stop_in_motion_stops_the_arm_and_only_a_reset_frees_it() -> None:
     loop.run(0.5)
     loop.put("active", True)
     loop.run(0.5)
-    assert stop_time_s(loop, since) < BRAKE_STOP_S
-    assert way_m(loop, since) < BRAKE_WAY_M
+    check_stop(loop, since, BRAKE)
     loop.put("reset")
     loop.run(0.3)
-    assert way_m(loop, since) < BRAKE_WAY_M
+    assert way_m(loop, since) < BRAKE[1]
     activate(loop)
     loop.run(0.5)
     assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
@@ -179,7 +179,7 @@ def test_active_toggled_ten_times_a_second_stays_smooth() -> None:
     since = mark(loop)
     loop.put("active", False)
     loop.run(1.0)
-    assert stop_time_s(loop, since) < BRAKE_STOP_S
+    assert stop_time_s(loop, since) < BRAKE[0]
     assert speed_m_s(loop).max() > MOVES_M_S
     assert way_m(loop, 1) < TOGGLED_WAY_M
     check_motion(loop)
@@ -197,7 +197,7 @@ def test_a_stop_while_something_is_held_does_not_drop_it() -> None:
     since = mark(loop)
     loop.put("stop")
     loop.run(1.5)
-    assert stop_time_s(loop, since) <= BRAKE_STOP_S
+    assert stop_time_s(loop, since) <= BRAKE[0]
     assert loop.world.gripper_state().holding
     slipped = loop.world.objects()["brick"][0] - loop.world.tcp()[0] - held
     assert np.linalg.norm(slipped) < SLIP_M

@@ -32,6 +32,8 @@ STEP_TOLERANCE_S = 0.002
 SOON_S = 0.3
 """For so long a node of these tests is new."""
 
+pytestmark = pytest.mark.realtime
+
 
 def refused(speaker: SingleWriterFilter, header: Header, mono_ns: int) -> str | None:
     try:

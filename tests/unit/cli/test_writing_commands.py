@@ -224,21 +224,11 @@ def test_a_folder_is_no_file_and_a_file_no_folder(writer: Writer, here: Path) ->
 
 
 @pytest.mark.parametrize("writer", CASES, ids=lambda each: each.words)
-@pytest.mark.parametrize(
-    ("folder", "why"),
-    [
-        ("nosuch", "there is no folder nosuch"),
-        ("RUN", "cannot be written: Not a directory"),
-        ("/proc/self", "cannot be written: "),
-    ],
-)
-def test_a_folder_in_which_nothing_can_be_written_is_named(
-    writer: Writer, folder: str, why: str, here: Path
-) -> None:
-    path = f"{folder}/{writer.name}"
+def test_a_folder_that_is_not_there_is_named(writer: Writer, here: Path) -> None:
+    path = f"nosuch/{writer.name}"
     said = refusal(writer, path)
     assert f"{path} cannot be written" in said
-    assert why in said
+    assert "there is no folder nosuch" in said
     assert not (here / "nosuch").exists()
 
 

@@ -38,6 +38,8 @@ STATE_HZ, RATE_HZ = 50.0, 10.0
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 APART_MM, ATOL_MM = 3.0, 0.01
 
+pytestmark = pytest.mark.realtime
+
 
 class Robot:
     """A command node that takes every worker, and an arm that rests.

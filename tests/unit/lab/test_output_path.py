@@ -103,6 +103,14 @@ def test_a_place_where_no_file_can_be_is_named(path: str, why: str) -> None:
     refused(output_file(Path(path), force=True), why)
 
 
+@pytest.mark.parametrize(
+    ("path", "why"),
+    [("/proc/run", "cannot be written: "), ("/dev/null/run", "cannot be written: Not a directory")],
+)
+def test_a_place_where_no_folder_can_be_is_named(path: str, why: str) -> None:
+    refused(output_folder(Path(path)), why)
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("no arm"), SystemExit(1)])
 def test_what_was_written_before_an_error_is_kept_and_named(
     tmp_path: Path, error: BaseException, capsys: Captured

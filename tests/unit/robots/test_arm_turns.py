@@ -383,6 +383,33 @@ def test_of_a_reading_that_does_not_hold_nothing_is_told_and_the_loop_goes_on(
     braked(turns)
 
 
+def test_what_is_no_command_of_this_arm_is_rejected_by_its_reason(turns: Turns) -> None:
+    key, zeros = turns.node.node.keys.command_joint, np.zeros(7)
+    strange = JointCommand(tuple("abcdefg"), zeros, zeros, zeros, "active")
+    fields = message.unpack(records.encode(strange))
+    wrong = [
+        b"",
+        b"\xff\x00nonsense",
+        message.pack({"names": ["a"]}),
+        message.pack(fields | {"position_rad": np.full(7, np.nan)}),
+        message.pack(fields | {"velocity_rad_s": np.zeros(3)}),
+        records.encode(strange),
+    ]
+
+    def put() -> None:
+        stamp_ns = turns.node.node.clock.wall_at(turns.mono_ns)
+        header = records.encode_header(Header(stamp_ns, 10**6, "command#1"))
+        turns.session.put(key, wrong[-1])
+        for payload in wrong:
+            turns.session.put(key, payload, attachment=header)
+
+    turns.script[MOVING] = put
+    turns.run()
+    reasons = ("no_header", "malformed", "invalid", "joint_names")
+    assert [turns.refused(reason) for reason in reasons] == [1, 3, 2, 1]
+    braked(turns)
+
+
 def once(turns: Turns, **said: Any) -> None:
     """It is in a fault for one reading, in full motion."""
     turns.script[MOVING] = turns.say(fault=FAULT, **said)

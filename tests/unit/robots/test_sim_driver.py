@@ -126,6 +126,7 @@ def test_every_arm_brakes_by_itself_when_a_stop_is_put(name: str, mode: str) -> 
                     session.put(*writer.command(step), attachment=writer.header(step))
             if step == 500:
                 assert all(arm.guard.following for arm in node.arms.values())
+                assert node.driver.status().detail["command"] == mode
                 session.put(node.node.keys.stop, "stop")
             node.step(Tick(1, step * STEP_NS, 0.0, 0.0))
             states = [arm.guard._measure() for arm in node.arms.values()]

@@ -36,6 +36,8 @@ PATIENCE_S = 30.0
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
 TOO_LATE = "an emergency stop came after this request"
 
+pytestmark = pytest.mark.realtime
+
 
 @dataclass
 class Rig:
