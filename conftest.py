@@ -50,8 +50,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     """Do not even import what -m leaves out: that takes as long as many tests."""
     chosen = config.option.markexpr
     if chosen.endswith("and realtime") and collection_path.suffix == ".py":
-        folder = collection_path.relative_to(ROOT).parts[1]
-        if folder not in IN_REAL_TIME and "realtime" not in collection_path.read_text("utf-8"):
+        folders = IN_REAL_TIME.intersection(collection_path.relative_to(ROOT).parts)
+        if not folders and "realtime" not in collection_path.read_text("utf-8"):
             return True
     mark = LEFT_OUT.get(collection_path.name)
     within = collection_path.parent.name in ("tests", "reliability")

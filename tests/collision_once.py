@@ -23,7 +23,7 @@ def remember_distances() -> None:
 def _once(find: Callable[..., Any]) -> Callable[..., Any]:
     found: dict[Any, Any] = {}
 
-    def once(self: CollisionModel, *asked: Any) -> Any:
+    def once(self: Any, *asked: Any) -> Any:
         key = (*map(_bytes, asked), self._model.saveToString(), *_shapes(self))
         if key not in found:
             found[key] = find(self, *asked)
@@ -38,7 +38,7 @@ def _bytes(asked: Any) -> bytes:
     return np.asarray(asked).tobytes()
 
 
-def _shapes(model: CollisionModel) -> Iterator[Any]:
+def _shapes(model: Any) -> Iterator[Any]:
     for shape in model._geometry.geometryObjects:
         points = getattr(shape.geometry, "points", list)()
         place = shape.placement.homogeneous.tobytes()
