@@ -378,6 +378,7 @@ COUNTERS = {
     "command.smoothing_failures": "times Ruckig found no plan",
     "dropped": "recorder: samples that were not written",
     "short_streams": "times too few of the samples that were sent arrived, see `net.short`",
+    "lost": "rolling record: messages that were sent and never reached it",
     "missed": "rolling record: samples that came while the disk took none",
     "gripper_bounded": "gripper commands that were bounded",
     "ros2.commands_sent": "set-points sent to ROS 2",
