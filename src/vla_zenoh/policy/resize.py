@@ -71,7 +71,7 @@ def _between(old: int, new: int) -> Weights:
     return _pairs(first + second - np.floor(second), old)
 
 
-def _pairs(at: NDArray[np.float64], old: int) -> Weights:
+def _pairs(at: NDArray[np.floating[Any]], old: int) -> Weights:
     at = np.clip(at, 0, old - 1)
     first = np.floor(at).astype(np.intp)
     second = (at - first).astype(np.float32)
