@@ -26,7 +26,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from vla_zenoh.lab.demo.scripted_motions import parse_scripted
+from vla_zenoh.errors import SpecError
+from vla_zenoh.lab.demo.scripted_motions import GRIPPER_AXIS, parse_scripted
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -36,6 +37,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.policy.options import number, whole_number
+from vla_zenoh.profile import load_profile
 
 ROUNDING = 1e-6
 """A smaller part of a step counts as none."""
@@ -51,6 +53,7 @@ class Scripted:
         dt_s: duration of a step.
         delay_ms: pretend an inference takes this long.
         jitter: vary that by up to this fraction either way.
+        profile: of the robot; one without a gripper gets no number for it.
     """
 
     example_prompts = ("HARD: go up", "HARD: yaw left", "HARD: close gripper", "hold")
@@ -62,7 +65,9 @@ class Scripted:
         dt_s: str = "0.1",
         delay_ms: str = "0",
         jitter: str = "0",
+        profile: str = "",
     ) -> None:
+        self._no_gripper = load_profile(profile).robot.no_gripper if profile else ""
         cameras = tuple(CameraSpec(camera=name) for name in camera.split(",") if name)
         self.spec = ModelSpec(
             name="scripted",
@@ -71,7 +76,7 @@ class Scripted:
                 horizon=whole_number("horizon", horizon),
                 dt_s=number("dt_s", dt_s),
                 rotation="rpy",
-                gripper="delta_m",
+                gripper="none" if self._no_gripper else "delta_m",
             ),
         )
         self._delay_s = number("delay_ms", delay_ms) / 1e3
@@ -87,6 +92,8 @@ class Scripted:
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk of the motion the prompt names."""
         asked = parse_scripted(observation.prompt)
+        if asked.motion is not None and asked.motion.axis == GRIPPER_AXIS and self._no_gripper:
+            raise SpecError(f"{asked.text!r}: {self._no_gripper}")
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
         begun, place = self._asked_by(observation.stamp_wall_ns, observation.task.speed)

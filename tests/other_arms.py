@@ -28,6 +28,7 @@ UR5: dict[str, Any] = {
         *("wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
     ],
     "finger_joints": [],
+    "gripper": None,
     "home_rad": [0.0, -1.57, 1.57, -1.57, -1.57, 0.0],
 }
 

@@ -50,6 +50,7 @@ class Reading:
         effort_nm: (n,); None: not measured. Where it is the external torque alone, set
             ``limits.contact.effort_stop_nm`` to have it monitored.
         width_m: opening of the gripper; None: not measured, that of the last command is assumed.
+            Only with a gripper that the profile declares (``robot.gripper``).
         moving: the gripper moves.
         holding: the gripper holds an object.
         wrench: (6,) external N and Nm at the TCP, base axes, without the weight of arm and tool,

@@ -219,7 +219,7 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
         return _cell(short, MAX_WORDS)
     if wrong := complaints(detail):
         return _cell(wrong, MAX_WORDS)
-    told = (detail.get(name) for name in ("busy", "slow", "renderer"))
+    told = (detail.get(name) for name in ("busy", "slow", "renderer", "gripper"))
     text = str(next(filter(None, told), ""))
     if not text and "obeyed" in detail:
         return (f"{mode}: in control" if detail["obeyed"] else "shadow mode") + _gpus(detail)

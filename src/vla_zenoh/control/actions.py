@@ -220,6 +220,8 @@ def step_width(
     """
     if spec.gripper == "none":
         return None
+    if math.isnan(max_width_m):
+        raise RecordError(f"gripper {spec.gripper}: the robot has no gripper")
     value, (low, high) = float(step[-1]), gripper_range(spec, max_width_m)
     if not low <= value <= high:
         of_width = f" m; this gripper opens to {max_width_m:g} m"

@@ -170,7 +170,7 @@ class ChunkPlanner:
         self._part, self._timing = profile.part, profile.timing
         self._limits = profile.limits
         self._rejecting = profile.limits.out_of_bounds == "refuse"
-        self._max_width_m = profile.robot.gripper.max_width_m
+        self._max_width_m = profile.robot.max_width_m
         self._pace = profile.composition.pace
         self._reach = reach
         self._gap_ns = round(profile.timing.state_timeout_s * 1e9)

@@ -68,7 +68,8 @@ class CommandedPart:
         self.gripper_state: Stamped[GripperState] | None = None
         self.planner = ChunkPlanner(profile, reach)
         self.motion = MotionPipeline(profile, reach, self.planner)
-        self.gripper = GripperArbiter(profile.robot.gripper)
+        gripper = profile.robot.gripper
+        self.gripper = None if gripper is None else GripperArbiter(gripper)
         self.contact, self.retreat = self.motion.contact, self.motion.retreat
         self.states = StateMonitor(
             profile,
@@ -141,15 +142,19 @@ class CommandedPart:
             self.retreat.measure(self.states.actual)
         if states.gripper is not None:
             self.gripper_state = states.gripper
-            if self.held is not None:
-                self._grasp_m = min(self._grasp_m, states.gripper.record.width_m)
+            width_m = states.gripper.record.width_m
+            if self.held is not None and width_m is not None:
+                self._grasp_m = min(self._grasp_m, width_m)
 
     # -- what it holds ------------------------------------------------------------------------
     @property
     def let_go(self) -> bool:
         """The gripper has opened since it holds something."""
-        gripper = self.gripper_state
-        return gripper is not None and gripper.record.width_m > self._grasp_m + LET_GO_M
+        return self._width_m is not None and self._width_m > self._grasp_m + LET_GO_M
+
+    @property
+    def _width_m(self) -> float | None:
+        return None if self.gripper_state is None else self.gripper_state.record.width_m
 
     def hold(self, box: HeldBox | None) -> None:
         """Count `box` among the arm's links from now on; None: the gripper holds nothing.
@@ -162,10 +167,11 @@ class CommandedPart:
                 "what the gripper holds needs the robot's kinematics: set robot.description, "
                 "robot.tcp_frame and robot.arm_joints in the profile"
             )
+        if box is not None and self.gripper is None:
+            raise RecordError(f"it holds nothing: {self.profile.robot.no_gripper}")
         self.reach.hold(box)
         self.held = box
-        gripper = self.gripper_state
-        self._grasp_m = np.inf if gripper is None else gripper.record.width_m
+        self._grasp_m = np.inf if self._width_m is None else self._width_m
         if self._joint_monitor is not None:
             self._joint_monitor.reset()  # what is too near now may only move apart
 
@@ -247,7 +253,7 @@ class CommandedPart:
         blocked = self.tracking.excuse(held_pose(measured), pose_of(measured))
         events = self.motion.anchor(
             measured,
-            self.gripper.keep(self.gripper_state.record),
+            np.nan if self.gripper is None else self.gripper.keep(self.gripper_state.record),
             joint,
             now_ns,
             blocked=blocked,
@@ -264,7 +270,8 @@ class CommandedPart:
     def commands(self, state: State, now_ns: int) -> MotionCommands:
         """The set-points of robot and gripper, while streaming."""
         arm, motion, width = self.motion.command(state), self.motion, None
-        if arm is not None and state is State.ACTIVE and motion.scaling.override > 0.0:
+        obeys = arm is not None and state is State.ACTIVE and motion.scaling.override > 0.0
+        if obeys and self.gripper is not None:
             if motion.goal is not None:
                 self.gripper.request(motion.goal.width_m)
             width = self.gripper.step(now_ns, self.gripper_state)
@@ -373,11 +380,14 @@ class GripperArbiter:
 
         Another width would end a grasp. Nothing is to be sent then.
         """
-        width_m = min(max(gripper.width_m, 0.0), self._profile.max_width_m)
+        measured_m = gripper.width_m
+        if measured_m is None:
+            raise RecordError("state/gripper has no width_m, and the profile declares a gripper")
+        width_m = min(max(measured_m, 0.0), self._profile.max_width_m)
         sent_m = self.sent_m
         if sent_m is not None:
-            grasps = gripper.holding and sent_m < gripper.width_m
-            if grasps or abs(sent_m - gripper.width_m) < SAME_WIDTH_M:
+            grasps = gripper.holding and sent_m < measured_m
+            if grasps or abs(sent_m - measured_m) < SAME_WIDTH_M:
                 width_m = sent_m
         self._requested_m = self.sent_m = width_m
         self.in_flight = False

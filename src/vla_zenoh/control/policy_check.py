@@ -129,6 +129,12 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
 
 
 def _action_errors(profile: Profile, action: ActionSpec) -> Iterator[Finding]:
+    if action.gripper != "none" and profile.robot.no_gripper:
+        yield error(
+            "gripper",
+            f"acts on a gripper (gripper: {action.gripper}), and {profile.robot.no_gripper}: use a "
+            'model of the arm alone, with gripper="none" and no number for it',
+        )
     if action.space == "joint":
         wanted, given = set(profile.robot.arm_joints), set(action.joints)
         if wanted != given:

@@ -112,6 +112,11 @@ def reasons_of_part(
     reasons = [*_guesses(profile), *_robot(profile, peers, pose, now_ns)]
     if gripper is None:
         return [*reasons, Passing("the gripper is not known: nothing received on state/gripper")]
+    if profile.robot.gripper is not None and gripper.record.width_m is None:
+        reasons.append(
+            "the robot reports no gripper, and the profile declares one: set robot.gripper: null "
+            "(and finger_joints: []) if it has none"
+        )
     lost = state_lost("gripper", gripper, profile.timing.state_timeout_s, now_ns)
     return [*reasons, *filter(None, (lost, why_not_ready(gripper.record)))]
 
@@ -385,7 +390,7 @@ def _chunk(
                 spec.action.of(part),
                 steps[:, spec.action.columns(part)],
                 profile.of_part(part).limits,
-                profile.of_part(part).robot.gripper.max_width_m,
+                profile.of_part(part).robot.max_width_m,
             )
         ]
     except SpecError:

@@ -224,7 +224,7 @@ def arm_kinematics(robot: RobotProfile) -> Kinematics:
         robot.arm_joints,
         robot.finger_joints,
         base_frame=robot.base_frame,
-        finger_ends=robot.gripper.joint_ends,
+        finger_ends=None if robot.gripper is None else robot.gripper.joint_ends,
         joint_range_rad=robot.joint_range_rad,
         locked_rad=robot.locked_rad,
     )

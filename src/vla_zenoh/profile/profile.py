@@ -489,6 +489,10 @@ def _ros2_arm(place: Place, ros2: Ros2Profile, robot: RobotProfile) -> Iterator[
     if gripper is not None:
         if gripper.grasp and gripper.type != "franka_msgs/action/Move":
             yield (*place, "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
+        if robot.gripper is None:
+            width = "gripper: {max_width_m: ...}, its largest opening"
+            yield (*place, "gripper"), f"needs robot.gripper: {width}"
+            return
         yield from _gripper_position(place, gripper, robot.gripper.joint_ends is not None)
         if gripper.type == JOINT_COMMANDS[0] and not robot.finger_joints:
             yield (*place, "gripper", "type"), "is a trajectory, which needs robot.finger_joints"

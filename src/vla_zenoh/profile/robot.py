@@ -9,6 +9,7 @@ from typing import Annotated, Literal, NamedTuple, get_args
 
 from pydantic import AfterValidator, Field
 
+from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import NODE_KINDS
 from vla_zenoh.profile.schema import Endpoints
 from vla_zenoh.profile.section import Fault, Name, Range, Section, Text, Vector3, Word, Words
@@ -44,7 +45,7 @@ class GripperProfile(Section):
         joint_shut_m: its position when the fingers meet.
     """
 
-    max_width_m: float = Field(default=0.08, gt=0, le=1)
+    max_width_m: float = Field(gt=0, le=1)
     speed_m_s: float = Field(default=0.1, ge=1e-4, le=1)
     force_n: float = Field(default=25.0, ge=0, le=500)
     dead_band_m: float = Field(default=0.001, gt=0, le=0.05)
@@ -109,7 +110,7 @@ class RobotProfile(Section):
         home_rad: joint positions of the simulated arm after a reset.
         posture: joint positions that a redundant arm keeps its elbow close to: ``start``, those at
             activation, or ``home``, to which the elbow then moves at once if joints are commanded.
-        gripper: its own section.
+        gripper: its own section; without it the robot has none.
     """
 
     name: Name
@@ -124,13 +125,31 @@ class RobotProfile(Section):
     finger_joints: Words = ()
     home_rad: tuple[float, ...] = Field(strict=False)
     posture: Literal["start", "home"] = "start"
-    gripper: GripperProfile = GripperProfile()
+    gripper: GripperProfile | None = None
 
     @property
     def node(self) -> str:
         """Kind of the node that drives it."""
         traits = NODE_KINDS.get(self.driver)
         return self.driver if traits is not None and traits.role == "robot" else "arm"
+
+    @property
+    def max_width_m(self) -> float:
+        """Largest opening of the gripper; NaN, which nothing fits into, without one."""
+        return math.nan if self.gripper is None else self.gripper.max_width_m
+
+    def require_gripper(self, what: str) -> GripperProfile:
+        """The gripper that `what` needs; a `ProfileError` if there is none."""
+        if self.gripper is None:
+            raise ProfileError(f"{what}: {self.no_gripper}")
+        return self.gripper
+
+    @property
+    def no_gripper(self) -> str:
+        """Sentence of a robot without a gripper; empty: it has one."""
+        if self.gripper is not None:
+            return ""
+        return f"robot {self.name!r} has no gripper: its profile declares none (robot.gripper)"
 
     def contradictions(self) -> Iterator[Fault]:
         joints, home, ranges = len(self.arm_joints), len(self.home_rad), len(self.joint_range_rad)
@@ -147,7 +166,11 @@ class RobotProfile(Section):
             yield ("locked_rad", name), "is in arm_joints, too: it cannot stand still and move"
         if shared := sorted(set(self.arm_joints) & set(self.finger_joints)):
             yield ("finger_joints",), f"repeats arm_joints: {', '.join(shared)}"
-        if self.gripper.dead_band_m >= self.gripper.max_width_m:
+        if self.gripper is None:
+            if self.finger_joints:
+                width = "gripper: {max_width_m: ...}, its largest opening"
+                yield ("finger_joints",), f"needs robot.gripper beside it: {width}"
+        elif self.gripper.dead_band_m >= self.gripper.max_width_m:
             width = f"max_width_m ({self.gripper.max_width_m:g})"
             yield ("gripper", "dead_band_m"), f"must be less than {width}: nothing would move"
 

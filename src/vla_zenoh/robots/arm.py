@@ -89,7 +89,7 @@ class Arm:
         share = 0.5 if driver.simulated else 0.9
         self._period_ns = share * 1e9 / profile.timing.state_hz
         self._seq = self._published_ns = self._mono_ns = 0
-        self._gripper = GripperState(profile.robot.gripper.max_width_m, False, False)
+        self._gripper = GripperState(None, moving=False, holding=False)
         self._published_fault = self._was = ""
 
     # -- one tick -----------------------------------------------------------------------------
@@ -343,7 +343,8 @@ class GripperCommands:
     def __init__(self, node: Node, driver: RobotDriver) -> None:
         self._node, self._driver, key = node, driver, driver.profile.keys.command_gripper
         self._commands = node.subscribe(key, CallbackRing(16, SMALL_BYTES))
-        self._guard = GripperGuard(driver.profile.robot.gripper)
+        gripper = driver.profile.robot.gripper
+        self._guard = None if gripper is None else GripperGuard(gripper)
 
     def drop(self) -> None:
         """Ignore the commands that arrived."""
@@ -358,11 +359,12 @@ class GripperCommands:
             command = self._node.decode(GripperCommand, arrival)
             if command is None:
                 continue
-            if self._driver.no_gripper:
-                self._node.reject("no_gripper", f"command/gripper: {self._driver.no_gripper}")
+            guard, why = self._guard, self._driver.profile.robot.no_gripper
+            if guard is None or (why := self._driver.no_gripper):
+                self._node.reject("no_gripper", f"command/gripper: {why}")
                 continue
             try:
-                accepted = self._guard.accept(
+                accepted = guard.accept(
                     command,
                     arm.writer,
                     0 if self._driver.lockstep else now_ns,  # in lockstep a command has no age
@@ -371,5 +373,5 @@ class GripperCommands:
             except CodecError as error:
                 self._node.reject(error.reason, f"command/gripper {error}")
                 continue
-            self._node.counters["gripper_bounded"] = self._guard.bounded
+            self._node.counters["gripper_bounded"] = guard.bounded
             self._driver.grip(accepted, now_ns)

@@ -160,9 +160,11 @@ class JointReading:
     def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
         robot = profile.robot
         self.arm_joints, self._finger_names = robot.arm_joints, robot.finger_joints
-        self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
+        self.has_gripper = robot.gripper is not None
+        if robot.gripper is not None:
+            self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
         self._finger_signs = dict(zip(robot.finger_joints, kinematics.finger_signs, strict=True))
-        self._max_width_m = robot.gripper.max_width_m
+        self._max_width_m = robot.max_width_m
         self._kinematics = kinematics
         self._home_quat = home_orientation(profile, kinematics)
         at = [kinematics.arm_joints.index(name) for name in robot.arm_joints]
@@ -290,6 +292,8 @@ class JointReading:
         While `busy` a goal is in flight. `wanted_m` is the last commanded width, used if no finger
         joints are described; `held`: the gripper reports that it holds an object.
         """
+        if not self.has_gripper:
+            return GripperState(None, moving=False, holding=False)
         if not self._finger_names:
             width_m = self._max_width_m if wanted_m is None else wanted_m
             return GripperState(width_m, busy, held)

@@ -280,6 +280,8 @@ class RobotNode:
         arms = self.arms.values()
         if arms:
             guards = [arm.guard for arm in arms]
+            if driver.profile.robot.no_gripper and not driver.profile.parts:
+                detail["gripper"] = "no gripper"
             detail["stop_latched"] = any(arm.stop_latched for arm in arms)
             detail["following"] = all(guard.following for guard in guards)
             node.counters[f"{node.name}.stream_silences"] = sum(one.silences for one in guards)

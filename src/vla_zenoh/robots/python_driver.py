@@ -5,6 +5,7 @@ A plug-in makes it, see `vla_zenoh.plugins`; that of the driver ``arm`` from a f
 
 from __future__ import annotations
 
+import math
 import operator
 import time
 from pathlib import Path
@@ -51,13 +52,14 @@ class PythonDriver(RobotDriver):
         self._complaint = ""
         """Why the last reading was rejected."""
         self._rate = RateMeter()
-        self._asked_m = profile.robot.gripper.max_width_m
+        self._asked_m = profile.robot.max_width_m
         self._width_m: float | None = None
         self._held_m: float | None = None
         """Width at which an object is held."""
         self.recovers = callable(getattr(self.robot, "recover", None))
         if not callable(getattr(self.robot, "grip", None)):
             self.no_gripper = f"{self._called} has no method grip"
+            self._asked_m = math.nan
         self.silent_why = f"{self._called}: read returns nothing new"
         self.stalled_hint = f"; does {self._called} wait for something?"
 
@@ -114,17 +116,19 @@ class PythonDriver(RobotDriver):
         gripper = measured.gripper
         assert gripper is not None
         self.measured_ns, self._width_m = measured_ns, gripper.width_m
-        if not gripper.moving:  # while the fingers move nobody knows
-            self._set_held(gripper)
+        if (
+            gripper.width_m is not None and not gripper.moving
+        ):  # while the fingers move nobody knows
+            self._set_held(gripper.width_m, holding=gripper.holding)
         self._rate.tick()
         return measured
 
-    def _set_held(self, gripper: GripperState) -> None:
-        width_m, held_m = gripper.width_m, self._held_m
-        self._held_m = width_m if gripper.holding else None
-        if gripper.holding and held_m is None:
+    def _set_held(self, width_m: float, *, holding: bool) -> None:
+        held_m = self._held_m
+        self._held_m = width_m if holding else None
+        if holding and held_m is None:
             self.report.emit(Event("info", "notice", "grasped", f"{width_m:.3f} m apart"))
-        elif held_m is not None and not gripper.holding and width_m < held_m + RELEASED_M:
+        elif held_m is not None and not holding and width_m < held_m + RELEASED_M:
             why = "the gripper lost its object and was not opened"
             self.report.emit(Event("warning", "notice", "object_lost", why))
 
@@ -141,8 +145,10 @@ class PythonDriver(RobotDriver):
 
     def status(self) -> DriverStatus:
         """Class, fault or else why a reading was rejected, width, and the robot's own entries."""
+        detail: dict[str, Any] = {"arm": self._called, "fault": self.fault}
         width_m = self._asked_m if self._width_m is None else self._width_m
-        detail = {"arm": self._called, "fault": self.fault, "width_m": width_m}
+        if not math.isnan(width_m):
+            detail["width_m"] = width_m
         if self._complaint and not self.fault:
             detail["complaint"] = self._complaint
         own = self._call("status") or {}
@@ -189,7 +195,7 @@ def measurement_of(
 ) -> Measurement:
     """A reading that was measured at `stamp_ns` (wall clock) as the records of an arm.
 
-    If it has no width, that is `asked_m`, the last commanded one.
+    If it has no width, that is `asked_m`, the last commanded one; NaN: it has no gripper.
 
     Raises:
         ValueError: a value is not a number, or impossible for this arm; it rejects all.
@@ -208,8 +214,13 @@ def measurement_of(
         maybe("effort_nm", len(names)),
     )
     wrench = maybe("wrench", 6)
-    width_m = asked_m if reading.width_m is None else reading.width_m
-    gripper = GripperState(width_m, reading.moving, reading.holding)
+    if reading.width_m is not None and not arm.has_gripper:
+        raise ValueError("width_m is given, and the profile declares no gripper (robot.gripper)")
+    if reading.width_m is None and math.isnan(asked_m):
+        gripper = GripperState(None, moving=False, holding=False)
+    else:
+        width_m = asked_m if reading.width_m is None else reading.width_m
+        gripper = GripperState(width_m, reading.moving, reading.holding)
     arm.take(joints, stamp_ns)
     return arm.measurement(wrench, gripper)
 

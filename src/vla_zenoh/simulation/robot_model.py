@@ -82,7 +82,7 @@ class RobotModel:
     gains: JointGains = JointGains()
     finger_joints: tuple[str, ...] = ("panda_finger_joint1", "panda_finger_joint2")
     finger_signs: tuple[float, ...] = (1.0, 1.0)  # -1: it goes backwards to open
-    gripper: GripperProfile = PANDA_HAND
+    gripper: GripperProfile | None = PANDA_HAND  # None: it has none
     finger_links: tuple[str, ...] = ("panda_leftfinger", "panda_rightfinger")  # touch the object
     tcp_link: str = "panda_hand_tcp"
     camera: MountedCamera | None = PANDA_WRIST

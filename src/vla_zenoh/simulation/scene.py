@@ -250,6 +250,8 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel) -> None:
 def finger_shares(robot: RobotModel) -> FloatArray:
     """(k,) m of opening per m or rad of each finger joint."""
     count = len(robot.finger_joints)
+    if robot.gripper is None:
+        return np.zeros(0)
     slope = Fingers(robot.gripper, count).slope
     return np.array(robot.finger_signs) * slope / count
 

@@ -15,7 +15,7 @@ from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.so3 import quat_from_rotation, rotation_from_rpy
 from vla_zenoh.policy.meaning import reference as as_reference
 from vla_zenoh.policy.meaning import toward
-from vla_zenoh.profile import Profile
+from vla_zenoh.profile import GripperProfile, Profile
 from vla_zenoh.simulation.impedance import (
     ArmDynamics,
     CartesianImpedance,
@@ -256,8 +256,9 @@ class SimulatedPart:
     ) -> None:
         self.robot, self._home_rad, self._gains, self._refresh = robot, home_rad, gains, refresh
         self._model, self._data = model, data
-        self.gripper = SimulatedGripper(model, data, robot)
-        self.set_gripper, self.gripper_state = self.gripper.command, self.gripper.state
+        self.gripper: SimulatedGripper | None = None
+        if robot.gripper is not None:
+            self.gripper = SimulatedGripper(model, data, robot, robot.gripper)
         joints = [model.joint(prefix_of(robot) + name) for name in robot.arm_joints]
         first_dof, first_q = int(joints[0].dofadr[0]), int(joints[0].qposadr[0])
         if [int(joint.dofadr[0]) - first_dof for joint in joints] != list(range(len(joints))):
@@ -296,7 +297,8 @@ class SimulatedPart:
     def reset(self) -> None:
         """Put the joints at home, at rest, with the gripper open."""
         self._position_rad[:] = self._home_rad
-        self.gripper.open()
+        if self.gripper is not None:
+            self.gripper.open()
         self.reset_laws()
 
     def reset_laws(self) -> None:
@@ -331,7 +333,8 @@ class SimulatedPart:
         if not math.isfinite(sum(output.torque_nm.tolist())):
             raise NodeError(f"the reference is not finite: {reference}")
         self._data.ctrl[self._actuators] = output.torque_nm
-        self.gripper.step(steps)
+        if self.gripper is not None:
+            self.gripper.step(steps)
         return output.saturated
 
     def _dynamics(self) -> ArmDynamics:
@@ -398,6 +401,18 @@ class SimulatedPart:
         """Reference at the measured TCP, at rest."""
         return PoseReference(*self.tcp(), np.zeros(6), np.zeros(6))
 
+    def gripper_state(self) -> GripperState:
+        """That of the gripper; without a width where the robot has none."""
+        if self.gripper is None:
+            return GripperState(None, moving=False, holding=False)
+        return self.gripper.state()
+
+    def set_gripper(self, width_m: float, speed_m_s: float, force_n: float) -> None:
+        """Command the gripper, see `SimulatedGripper.command`; a `RecordError` without one."""
+        if self.gripper is None:
+            raise RecordError("this robot has no gripper")
+        self.gripper.command(width_m, speed_m_s, force_n)
+
     def wrench(self) -> FloatArray:
         """(6,) external contact wrench of the last step: N, Nm about the TCP, base axes.
 
@@ -462,14 +477,20 @@ class SimulatedGripper:
     A robot without finger joints has one in name: its width is the set one.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotModel) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        robot: RobotModel,
+        gripper: GripperProfile,
+    ) -> None:
         self._model, self._data = model, data
         fingers = [model.joint(prefix_of(robot) + name) for name in robot.finger_joints]
         self._q = [data.qpos[joint.qposadr[0] :][:1] for joint in fingers]
         self._v = [data.qvel[joint.dofadr[0] :][:1] for joint in fingers]
         self._shares = finger_shares(robot).tolist() if fingers else []
-        self._signs, self._max_width_m = robot.finger_signs, robot.gripper.max_width_m
-        self._widths = Fingers(robot.gripper, len(fingers))
+        self._signs, self._max_width_m = robot.finger_signs, gripper.max_width_m
+        self._widths = Fingers(gripper, len(fingers))
         # The actuator's opening is without the constant part of the width.
         self._shut_m = self._widths.width_m(0.0)
         self._actuator = int(model.actuator(prefix_of(robot) + GRIPPER).id) if fingers else None

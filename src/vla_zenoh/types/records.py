@@ -111,21 +111,29 @@ class GripperState(Record):
     """Gripper and robot condition.
 
     Args:
-        width_m: opening between the fingers.
+        width_m: opening between the fingers; None: the robot has no gripper.
         mode: the robot's name for its mode, ``ready`` when it will move.
         faults: reported by the robot.
     """
 
-    width_m: Annotated[float, Meta(ge=-0.01, le=1.0)]
+    width_m: Annotated[float, Meta(ge=-0.01, le=1.0)] | None
     moving: bool
     holding: bool
     mode: Name = "ready"
     faults: Annotated[tuple[_LongText, ...], Meta(max_length=MAX_ENTRIES)] = ()
 
     @property
+    def opening_m(self) -> float:
+        """The width, as a number: NaN without a gripper."""
+        return math.nan if self.width_m is None else self.width_m
+
+    @property
     def kept_width_m(self) -> float:
-        """The width (m) to command so that nothing changes: shut, where an object is held."""
-        return 0.0 if self.holding else max(self.width_m, 0.0)
+        """The width (m) to command so that nothing changes: shut, where an object is held.
+
+        NaN without a gripper.
+        """
+        return 0.0 if self.holding else max(self.opening_m, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

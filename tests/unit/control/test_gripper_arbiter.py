@@ -9,7 +9,7 @@ from vla_zenoh.profile import GripperProfile
 from vla_zenoh.types import GripperState, Header, Stamped
 
 MS = 1_000_000
-PROFILE = GripperProfile(speed_m_s=0.07, force_n=12.0)
+PROFILE = GripperProfile(max_width_m=0.08, speed_m_s=0.07, force_n=12.0)
 
 
 def state(now_ns: int, *, moving: bool) -> Stamped[GripperState]:

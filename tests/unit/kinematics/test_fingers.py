@@ -73,7 +73,7 @@ def test_an_opening_there_and_back_is_the_same(
 
 
 def test_fingers_that_slide_add_up_to_the_opening() -> None:
-    fingers = Fingers(GripperProfile(), 2)
+    fingers = Fingers(GripperProfile(max_width_m=0.08), 2)
     assert fingers.width_m([0.01, 0.02]) == pytest.approx(0.03)
     assert fingers.width_m([0.01]) == pytest.approx(0.02), "one stands for both"
     assert fingers.speed_m_s([-0.01, -0.01]) == pytest.approx(0.02)

@@ -192,7 +192,7 @@ def _compare(path: Path, a: str, b: str, tolerance_s: float) -> Disagreement:
         specs[a].action,
         specs[b].action,
         lambda stamp_ns: arm_state(run, stamp_ns),
-        max_width_m=run.profile.robot.gripper.max_width_m if grips else 0.0,
+        max_width_m=run.profile.robot.max_width_m if grips else 0.0,
         tolerance_s=tolerance_s,
     )
 

@@ -92,7 +92,7 @@ class _EnvironmentWorld:
         self._next_ns: int | None = None
         self._step_ns = round(clock.benchmark.action.dt_s * 1e9)
         self._see()
-        self._width_m = self._gripper.width_m
+        self._width_m = self._gripper.opening_m
         zeros = np.zeros(JOINTS)
         self._joints = JointState(
             tuple(f"joint{i}" for i in range(1, JOINTS + 1)), zeros, zeros, None

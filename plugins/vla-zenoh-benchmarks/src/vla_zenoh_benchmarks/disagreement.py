@@ -53,7 +53,7 @@ def arm_state(run: Run, stamp_ns: int) -> ArmState:
         raise RecordError(
             "the pose of the arm is unknown: no state/pose or no state/gripper was recorded"
         )
-    return ArmState(pose_of(pose.record), gripper.record.width_m)
+    return ArmState(pose_of(pose.record), gripper.record.opening_m)
 
 
 class RequestedPath(NamedTuple):

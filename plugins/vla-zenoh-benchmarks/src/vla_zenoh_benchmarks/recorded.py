@@ -72,7 +72,8 @@ class EpisodeRecorder:
         self._path, self._part = path, path.with_suffix(".part")
         self._part.unlink(missing_ok=True)
         self._keys, self._worker = profile.keys, worker
-        self._action, self._gripper = action, profile.robot.gripper
+        self._action = action
+        self._gripper = profile.robot.require_gripper("a recording of a benchmark")
         self._width_m = self._gripper.max_width_m
         self._spec_hash = spec.hash
         self._task = Task(1, True, "", worker, min(1000.0, 1.0 / action.dt_s))

@@ -180,7 +180,7 @@ class _LockstepStage:
         return self._running.now_ns / 1e9
 
     def scene(self) -> SceneSnapshot:
-        width_m = self.world.gripper_state().width_m
+        width_m = self.world.gripper_state().opening_m
         return SceneSnapshot(self._running.now_ns, self._objects(), width_m, self.world.tcp()[0])
 
     def failure(self) -> tuple[str, str] | None:

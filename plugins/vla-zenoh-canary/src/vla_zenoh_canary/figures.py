@@ -168,7 +168,7 @@ class WorkerWatch:
         for part in lease.spec.parts:
             own, action = self._profile.of_part(part), lease.spec.action
             steps = chunk.record.steps[:, action.columns(part)]
-            width_m = own.robot.gripper.max_width_m
+            width_m = own.robot.max_width_m
             for error in chunk_errors(action.of(part), steps, own.limits, width_m):
                 return error.name
         return ""
@@ -326,7 +326,7 @@ class RobotWatch:
     def _difference(
         self, part: str, one: ModelSpec, before: ActionChunk, other: ModelSpec, after: ActionChunk
     ) -> Difference:
-        width_m = self._profile.of_part(part).robot.gripper.max_width_m
+        width_m = self._profile.of_part(part).robot.max_width_m
         joint = "joint" in (one.action.of(part).space, other.action.of(part).space)
         arm = self._arm_of(part) if joint else None
         start = self._start(part, before.observation_stamp_ns, arm)
@@ -342,7 +342,7 @@ class RobotWatch:
         if not self._states[part]:
             raise RecordError("no pose of the arm came")
         state = min(self._states[part], key=lambda each: abs(each.stamp_ns - stamp_ns))
-        width_m = 0.0 if state.gripper is None else state.gripper.width_m
+        width_m = 0.0 if state.gripper is None else state.gripper.opening_m
         joints_rad = None
         if arm is not None and state.joint is not None:
             joints_rad = arm.joints_of(state.joint)

@@ -172,9 +172,13 @@ def robot(seen: Seen, profile: Profile, kinematics: Kinematics) -> Iterator[Rule
     joints, poses, grippers = by_key.values()
     yield from _joints(list(joints.values()), profile, kinematics)
     yield from _poses([(joints[at], poses[at]) for at in sorted(together)], profile, kinematics)
-    widths_m = [gripper.width_m for gripper in grippers.values()]
-    if widths_m:
-        most_m = profile.robot.gripper.max_width_m
+    known = [gripper.width_m for gripper in grippers.values()]
+    widths_m = [width_m for width_m in known if width_m is not None]
+    if known and (profile.robot.gripper is None) != (not widths_m):
+        text = profile.robot.no_gripper or "the profile's gripper has no width_m"
+        yield RuleFinding("gripper as declared", False, text)
+    elif widths_m:
+        most_m = profile.robot.max_width_m
         text = f"up to {max(widths_m):.4g} m; the profile's gripper opens {most_m:g} m"
         yield RuleFinding("gripper width in m", max(widths_m) <= most_m + WIDTH_M, text)
 

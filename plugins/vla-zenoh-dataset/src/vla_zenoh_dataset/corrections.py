@@ -52,7 +52,7 @@ class CommandedMotion:
                 "them led with --worker"
             )
         self._run, self._spec = run, spec
-        self._max_width_m = run.profile.robot.gripper.max_width_m
+        self._max_width_m = run.profile.robot.max_width_m
         # Absolute poses lie around the home orientation, deltas around no motion.
         absolute = spec.space == "tcp" and spec.kind == "absolute"
         self._reference = home_reference(run.profile) if absolute else IDENTITY
@@ -117,6 +117,8 @@ class CommandedMotion:
         found = newest(self._run.gripper_commands, at_ns) or newest(self._run.grippers, at_ns)
         if found is None:
             raise self._missing("neither command/gripper nor state/gripper", at_ns)
+        if found.record.width_m is None:
+            raise RecordingError(f"{self._run.path}: {self._run.profile.robot.no_gripper}")
         return max(float(found.record.width_m), 0.0)
 
     def _missing(self, what: str, at_ns: int) -> RecordingError:

@@ -255,11 +255,15 @@ def _of_part(part: str, names: Sequence[str]) -> list[str]:
 
 def usual_state(episodes: Sequence[RecordedEpisode]) -> str:
     """Parts of the state that go with the actions: joints with joints, else the pose."""
-    first = episodes[0].spec.action.of(episodes[0].spec.parts[0]) if episodes else None
-    if first is None or first.space != "joint":
+    if not episodes:
         return "position+rpy+gripper_m"
+    part = episodes[0].spec.parts[0]
+    first = episodes[0].spec.action.of(part)
+    gripper = "+gripper_m" if episodes[0].run.of_part(part).profile.robot.gripper else ""
+    if first.space != "joint":
+        return f"position+rpy{gripper}"
     if not in_lerobots_numbers(first):
-        return "joint+gripper_m"
+        return f"joint{gripper}"
     return LEROBOT_STATE if first.gripper != "none" else "joint"
 
 
@@ -278,7 +282,8 @@ def _actions(spec: ActionSpec, steps: NDArray[np.float32], run: Run, part: str) 
         return steps
     rows = steps.astype(np.float64)
     if spec.gripper != "none":
-        max_width_m = run.of_part(part).profile.robot.gripper.max_width_m
+        robot = run.of_part(part).profile.robot
+        max_width_m = robot.require_gripper(f"{run.path}: gripper={spec.gripper}").max_width_m
         shares = [spec.gripper_scale(max_width_m).decode(number) for number in rows[:, -1]]
         rows[:, -1] = np.greater(shares, 0.5) if spec.gripper == "binary" else shares
     return semantics_of(spec).rows(rows)
@@ -332,7 +337,7 @@ def check_gripper_widths(episodes: Sequence[RecordedEpisode], names: Sequence[st
         if not (shares or by_width or action.gripper == "open_fraction"):
             continue
         runs = {str(each.run.path): each.run.of_part(part) for each in episodes}
-        widths = {name: run.profile.robot.gripper.max_width_m for name, run in runs.items()}
+        widths = {name: run.profile.robot.max_width_m for name, run in runs.items()}
         first, *others = widths
         other = next((name for name in others if widths[name] != widths[first]), None)
         if other is not None:

@@ -51,7 +51,7 @@ def succeeded(episode: RecordedEpisode) -> bool | None:
         if width is None or pose is None:
             continue
         time_s = (at_ns - episode.since_ns) / 1e9
-        verdict = judge.update(entry.record, width.record.width_m, time_s, pose.record.position_m)
+        verdict = judge.update(entry.record, width.record.opening_m, time_s, pose.record.position_m)
         if verdict is not None:
             break
     return (verdict or judge.end()).success

@@ -72,6 +72,7 @@ class Arm(EmbodimentBase):
             loaded = load_profile(profile)
             if endpoint:
                 loaded = override(loaded, {"session": {"connect": [endpoint]}})
+            self._max_width_m = loaded.robot.require_gripper("its action has one").max_width_m
             self._targets = Targets(loaded, rate_hz)
         except VlaZenohError as error:
             raise ConfigError(str(error)) from error
@@ -202,7 +203,7 @@ class Arm(EmbodimentBase):
         assert self._robot is not None
         joint, gripper = self._robot.joint_state().record, self._robot.gripper_state().record
         at = dict(zip(joint.names, joint.position_rad, strict=True))
-        opening = gripper.kept_width_m / self._profile.robot.gripper.max_width_m
+        opening = gripper.kept_width_m / self._max_width_m
         joints = [float(at[name]) for name in self._profile.robot.arm_joints]
         return np.array([*joints, min(float(opening), 1.0)])
 

@@ -44,7 +44,9 @@ class LeRobotArm:
         names = profile.robot.arm_joints
         self._keys = [f"{name}.pos" for name in settings.motors or names]
         self._gripper = f"{settings.gripper}.pos" if settings.gripper else ""
-        self._width_m = profile.robot.gripper.max_width_m
+        if settings.gripper:
+            profile.robot.require_gripper(f"lerobot.gripper {settings.gripper!r}")
+        self._width_m = profile.robot.max_width_m
         sign = np.array([-1.0 if name in settings.reversed else 1.0 for name in names])
         if settings.units == "degrees":
             self._zero = np.array(settings.zero_deg or (0.0,) * len(names))

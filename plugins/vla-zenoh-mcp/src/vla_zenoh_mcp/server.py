@@ -162,9 +162,11 @@ class McpServer:
             "position_m": pose.position_m.tolist(),
             "quat_xyzw": pose.quat_xyzw.tolist(),
             "joints_rad": dict(zip(joint.names, joint.position_rad.tolist(), strict=True)),
-            "gripper": {
+            "gripper": None
+            if gripper.width_m is None
+            else {
                 "width_m": gripper.width_m,
-                "max_width_m": robot.profile.robot.gripper.max_width_m,
+                "max_width_m": robot.profile.robot.max_width_m,
                 "holding": gripper.holding,
             },
             "workers": sorted(n.removeprefix(worker) for n in robot.alive if n.startswith(worker)),

@@ -13,7 +13,7 @@ from vla_zenoh.profile import ReachLimits
 from vla_zenoh_newarm.answers import Answers, Guess
 from vla_zenoh_newarm.gripper import Gripper, gripper
 from vla_zenoh_newarm.mended import Mended
-from vla_zenoh_newarm.posture import Posture, posture
+from vla_zenoh_newarm.posture import Posture, points_down, posture, tool_axis
 from vla_zenoh_newarm.structure import Structure, structure
 
 VELOCITY_SHARE, FASTEST_RAD_S, FASTEST_M_S = 0.5, 1.0, 0.2
@@ -113,15 +113,15 @@ def _gripper(file: Path, links: Structure, answers: Answers) -> Gripper:
     from vla_zenoh.kinematics.description import Description
 
     found = gripper(Description(file), links.fingers)
-    if not found.joints:
-        return found
-    names = tuple(found.values)
+    names = tuple(found.values) or ("max_width_m",)
     what = f"{', '.join(names)} of {', '.join(found.joints)}"
+    if not found.joints:
+        what = "no joint of a finger was found: the robot has no gripper"
     values = answers.numbers(
         "gripper", list(found.values.values()), "robot.gripper", what, (len(names), 0)
     )
     if not values:
-        return Gripper()
+        return Gripper(why=found.why)
     return found._replace(values=dict(zip(names, values, strict=True)))
 
 
@@ -135,7 +135,10 @@ def posture_of(kinematics: Kinematics, table_z_m: float | None, answers: Answers
         home = answers.numbers("home", (), "robot.home_rad", "", (size,))
     found = posture(kinematics, reach, home)
     if given is None:
-        what = "joint positions at home, away from singularities, itself and the table"
+        what = "joint positions at home, away from singularities, itself and the table; the tool "
+        axis = tool_axis(kinematics, kinematics.forward(np.array(found.home_rad)).rotation)
+        along = ", ".join(f"{value:.2f}" for value in axis)
+        what += "points down" if points_down(axis) else f"points along ({along}) of the base"
         home = answers.numbers("home", found.home_rad, "robot.home_rad", what, (size,))
         if home != found.home_rad:
             found = posture(kinematics, reach, home)

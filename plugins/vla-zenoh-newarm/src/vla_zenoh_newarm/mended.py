@@ -54,7 +54,11 @@ class Mended:
         root, undeclared = _root(source)
         self.changes: list[str] = []
         if undeclared:
-            self.changes.append(f"{', '.join(undeclared)}: prefixes without a namespace, left out")
+            marked = ", ".join(f"{prefix}:..." for prefix in undeclared)
+            self.changes.append(
+                f"what begins with {marked} is left out: the file does not declare the XML prefix "
+                "(xmlns); joints and links are not affected"
+            )
         if root is not None and root.tag == "mujoco":
             from vla_zenoh_newarm.mjcf import FromMjcf
 
@@ -122,7 +126,11 @@ def _without_prefixes(source: Path) -> tuple[ElementTree.Element | None, Sequenc
     parser.StartElementHandler, parser.EndElementHandler = start, builder.end
     try:
         parser.Parse(source.read_bytes(), True)
-        return builder.close(), [prefix for prefix in prefixes if prefix != "xmlns"]
+        root = builder.close()
+        for parent in list(root.iter()):
+            for child in [each for each in parent if ":" in each.tag]:
+                parent.remove(child)
+        return root, [prefix for prefix in prefixes if prefix != "xmlns"]
     except (expat.ExpatError, AssertionError):
         return None, ()
 

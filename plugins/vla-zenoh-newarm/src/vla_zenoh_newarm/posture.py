@@ -9,14 +9,19 @@ import numpy as np
 
 from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.kinematics.kinematics import InverseKinematics, Kinematics, smallest_singular_value
-from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.kinematics.so3 import Pose, exp3
 from vla_zenoh.profile import POSE_JOINTS, ReachLimits
 from vla_zenoh.profile.limits import REACH_M
+from vla_zenoh.simulation.robot_model import MIN_TOOL_M
 from vla_zenoh.types import FloatArray
 
 SAMPLES = 1000
 BEST = 150
 """Samples of which distances are computed, the best first."""
+TURNED = 40
+"""Of those, of which it is tried whether the tool can point down there."""
+DOWN = 0.98
+"""Cosine of the angle to straight down within which a tool counts as pointing there."""
 INNER = 0.75
 """Part of each joint's range, about its middle, in which a home lies."""
 OVERLAPS, OVERLAP_SHARE = 4, 0.9
@@ -96,6 +101,9 @@ def _home(
     """The best of the samples that is near nothing; whether there is one; links that may touch."""
     scores = np.array([_score(kinematics, each, table_m, reach_m) for each in samples_rad])
     homes = np.round(samples_rad[np.argsort(-scores)[:BEST]], 2)
+    down = [found for home in homes[:TURNED] if (found := _turned_down(kinematics, home))]
+    down.sort(key=lambda home: -_score(kinematics, np.array(home), table_m, reach_m))
+    homes = np.array([*down, *homes.tolist()])
     touching: tuple[tuple[str, str], ...] = ()
     for _ in range(OVERLAPS):
         allowed = reach.model_copy(update={"may_touch": touching})
@@ -133,13 +141,46 @@ def _score(kinematics: Kinematics, joints_rad: FloatArray, table_m: float, reach
     scaled[:3] /= max(reach_m, 0.1)
     x_m, y_m, z_m = (here.position_m / max(reach_m, 0.1)).tolist()
     height = z_m - table_m / max(reach_m, 0.1)
-    tool = here.rotation @ kinematics.tool_m
-    length_m = float(np.linalg.norm(tool))
-    up = float(tool[2]) / length_m if length_m > 1e-3 else 0.0
+    up = float(tool_axis(kinematics, here.rotation)[2])
     score = 4.0 * min(smallest_singular_value(scaled), 0.3)
     score -= abs(x_m - 0.6) + abs(y_m) + 2.0 * max(0.0, ABOVE_TABLE - height)
     score -= max(0.0, height - 0.6)
     return score - 0.5 * up
+
+
+def tool_axis(kinematics: Kinematics, rotation: FloatArray) -> FloatArray:
+    """(3,) where the tool points, from the last joint to the TCP; of a tool of no length along z.
+
+    Args:
+        rotation: of the TCP.
+    """
+    length_m = float(np.linalg.norm(kinematics.tool_m))
+    own = kinematics.tool_m / length_m if length_m > MIN_TOOL_M else np.array([0.0, 0.0, 1.0])
+    return rotation @ own
+
+
+def points_down(axis: FloatArray) -> bool:
+    """Whether a tool along `axis` points down."""
+    return float(axis[2]) < -DOWN
+
+
+def _turned_down(kinematics: Kinematics, home_rad: FloatArray) -> tuple[float, ...]:
+    """The same home with the tool turned down on the shortest way; empty: it cannot."""
+    here = kinematics.forward(home_rad)
+    axis = tool_axis(kinematics, here.rotation)
+    across = np.cross(axis, [0.0, 0.0, -1.0])
+    sine = float(np.linalg.norm(across))
+    if sine < 1e-6:
+        return tuple(home_rad.tolist()) if points_down(axis) else ()
+    turn = exp3(across / sine * float(np.arctan2(sine, -axis[2])))
+    goal = Pose(here.position_m, turn @ here.rotation)
+    joints_rad = InverseKinematics(kinematics, home_rad).approach(goal, home_rad).joints_rad
+    reached = kinematics.forward(joints_rad).rotation
+    return (
+        tuple(np.round(joints_rad, 2).tolist())
+        if points_down(tool_axis(kinematics, reached))
+        else ()
+    )
 
 
 def _is_free(kinematics: Kinematics, barriers: Barriers, home_rad: FloatArray) -> bool:

@@ -63,6 +63,9 @@ def profile_text(name: str, source: str, description: str, arm: Arm) -> str:
     ]
     if arm.gripper.joints:
         lines += ["  finger_joints:", *(f"    - {_text(joint)}" for joint in arm.gripper.joints)]
+    if not arm.gripper.values:
+        lines += [f"  gripper: null{mark('robot.gripper')}"]
+    else:
         lines += [f"  gripper:{mark('robot.gripper')}"]
         lines += [f"    {key}: {value:g}" for key, value in arm.gripper.values.items()]
     table = "null" if arm.table_z_m is None else f"{arm.table_z_m:g}"

@@ -110,7 +110,7 @@ class UnattendedOperator:
         if header.stamp_wall_ns <= self._poses_ns:
             return None
         self._poses_ns = header.stamp_wall_ns
-        width_m = self._states.read(GripperState)[1].width_m
+        width_m = self._states.read(GripperState)[1].opening_m
         tcp_m = self._states.read(PoseState)[1].position_m
         verdict = self._poses.update(objects, width_m, self._time_s(), tcp_m)
         if verdict is None or self._robot_changed():

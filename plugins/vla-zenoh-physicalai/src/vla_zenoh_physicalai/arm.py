@@ -38,7 +38,9 @@ class PhysicalAiArm:
         self._profile, self._options = profile, options
         self._where = options.endpoint or wire.local_endpoint(options.name)
         self._goal_time_s = 1.0 / profile.timing.command_hz
-        self._width_range_m = profile.robot.gripper.max_width_m
+        if options.gripper:
+            profile.robot.require_gripper(f"physicalai.gripper {options.gripper!r}")
+        self._width_range_m = profile.robot.max_width_m
         self._session: zenoh.Session | None = None
         self._rejected, self._complaint = 0, ""
         self._read_s = self._others_s = 0.0

@@ -61,7 +61,9 @@ class PhysicalAiClient:
             *(robot, self._names, unit), joints=joints, gripper=GRIPPER if grips else ""
         )
         self._class, self._joints = f"vla_zenoh.{unit}", joints
-        self._max_width_m = robot.robot.gripper.max_width_m
+        if grips:
+            robot.robot.require_gripper("gripper=yes of this model")
+        self._max_width_m = robot.robot.max_width_m
         self._silence_s = number("silence_s", silence_s)
         wire.key(name, "state")
         self._session: Any = None

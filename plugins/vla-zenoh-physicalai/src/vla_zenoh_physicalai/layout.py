@@ -65,7 +65,7 @@ class Layout:
         self._at = [names.index(name) for name in joints]
         self._gripper_at = names.index(gripper) if gripper else None
         self._ends = gripper_ends
-        self._width_m = profile.robot.gripper.max_width_m
+        self._width_m = profile.robot.max_width_m
         ours = profile.robot.arm_joints
         sign = np.array([-1.0 if name in reversed else 1.0 for name in ours])
         self._zero = np.array(zero or (0.0,) * len(ours))

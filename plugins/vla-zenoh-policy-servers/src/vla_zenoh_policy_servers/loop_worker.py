@@ -51,7 +51,7 @@ class LoopWorker:
             action=action,
         )
         self._joints = profile.robot.arm_joints
-        self._max_width_m = profile.robot.gripper.max_width_m
+        self._max_width_m = profile.robot.require_gripper("its last number").max_width_m
         self._session = RobotSession(
             profile, session, self, name, images="raw", host=None, changed=Wake()
         )

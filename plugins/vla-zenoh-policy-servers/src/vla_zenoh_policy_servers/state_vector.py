@@ -188,6 +188,8 @@ class StateNumbers:
             values = ROTATION_FORMS[name].encode(measured.quat_xyzw, self.reference)
             return [value / self._unit_of(name) for value in values]
         if name in GRIPPERS:
+            if measured.width_m is None:
+                raise SpecError(f"the state has {name}, and this robot has no gripper")
             share = measured.width_m / self.max_width_m
             if name == "fingers_m":
                 return [measured.width_m / 2, -measured.width_m / 2]
@@ -293,8 +295,10 @@ def state_numbers(
     cut = any(_WHOLE.get(name, (name,))[0] in CUT for name in names)
     given = units.rotation_reference
     near = read_reference(given) if given != HOME else home_reference(profile) if cut else IDENTITY
-    width_m = robot.gripper.max_width_m
-    return StateNumbers(tuple(names), robot.arm_joints, width_m, units, near)
+    grips = [name for name in names if name in GRIPPERS]
+    if grips and robot.no_gripper:
+        raise SpecError(f"the state has {', '.join(grips)}, and {robot.no_gripper}: leave it out")
+    return StateNumbers(tuple(names), robot.arm_joints, robot.max_width_m, units, near)
 
 
 def home_reference(profile: Profile) -> tuple[float, ...]:

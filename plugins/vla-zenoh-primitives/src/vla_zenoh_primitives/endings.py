@@ -105,7 +105,7 @@ class Gripped:
             self._moved_s = sight.now_s
         if sight.now_s - self._moved_s < GRIPPED_S:
             return ""
-        off_m = abs(gripper.width_m - self._width_m)
+        off_m = abs(gripper.opening_m - self._width_m)
         return "reached" if self._closing or off_m < WIDTH_TOLERANCE_M else "bound"
 
 
@@ -121,7 +121,7 @@ class RunEnding:
         return next((name for name in self._until.names if getattr(self, f"_{name}")(sight)), "")
 
     def _gripper(self, sight: Sight) -> bool:
-        gripper, part = sight.gripper, sight.gripper.width_m / self._max_width_m
+        gripper, part = sight.gripper, sight.gripper.opening_m / self._max_width_m
         if self._until.gripper == "open":
             return part > WIDE and not gripper.moving
         return gripper.holding or (part < SHUT and not gripper.moving)

@@ -248,7 +248,12 @@ class PrimitivesNode:
             raise Rejected(f"the arm is {latched}; `vla-zenoh reset` clears it")
         if task.active:
             raise Rejected(f"worker {task.worker!r} moves the arm: deactivate it first")
-        sight, most_m = self._sight(), profile.robot.gripper.max_width_m
+        sight, most_m = self._sight(), profile.robot.max_width_m
+        grips = isinstance(request, Grip) or (
+            isinstance(request, RunModel) and bool(request.until.gripper)
+        )
+        if grips and profile.robot.no_gripper:
+            raise Rejected(profile.robot.no_gripper)
         if isinstance(request, RunModel):
             return self._prepare_run(request, sight, most_m)
         if isinstance(request, Grip):

@@ -147,7 +147,7 @@ class Answers:
         self, steps: Any, start_rad: FloatArray, start_m: float
     ) -> tuple[FloatArray, FloatArray]:
         """Joints (H, n) and width (H,) at the end of each of the model's steps."""
-        action, most_m = self._policy.spec.action, self._profile.robot.gripper.max_width_m
+        action, most_m = self._policy.spec.action, self._profile.robot.max_width_m
         widths_m, width_m = list[float](), start_m
         for step in steps:
             wanted_m = step_width(action, step, width_m, most_m)

@@ -152,7 +152,9 @@ class Numbers:
         )
         self._zero = np.array([robot.zero.get(theirs[joint], 0.0) for joint in ours])
         self._gripper = robot.gripper
-        self._max_width_m = profile.robot.gripper.max_width_m
+        if robot.gripper is not None:
+            profile.robot.require_gripper("gripper of the declaration")
+        self._max_width_m = profile.robot.max_width_m
 
     @property
     def grips(self) -> bool:

@@ -139,7 +139,7 @@ class R2cPolicy:
         joint, gripper = observation.joint, observation.gripper
         assert joint is not None
         order = [joint.names.index(name) for name in self._joints]
-        width_m = np.array(gripper.width_m if gripper is not None else 0.0)
+        width_m = np.array(gripper.opening_m if gripper is not None else 0.0)
         return wire.Seen(
             stamp_ms=observation.stamp_wall_ns // 1_000_000,
             id=asked,

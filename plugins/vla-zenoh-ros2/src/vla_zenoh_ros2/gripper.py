@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
-from vla_zenoh.profile import Profile
+from vla_zenoh.profile import GripperProfile, Profile
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS
 from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import Event, GripperCommand
@@ -113,7 +113,9 @@ class Gripper:
     ) -> None:
         assert profile.ros2 is not None
         gripper = self._profile = profile.ros2.gripper
-        self._node, self._messages, self._limits = node, messages, profile.robot.gripper
+        self._node, self._messages = node, messages
+        # Without a gripper nothing is commanded, and no limit is used.
+        self._limits = profile.robot.gripper or GripperProfile(max_width_m=1.0)
         self._blocked, self._fingers = blocked, fingers or {}
         self._measured_m, self._sent_m = width, self._limits.max_width_m
         self._goals = GoalSequencer(GOAL_TIMEOUT_S, self._limits.max_width_m)

@@ -80,7 +80,7 @@ def serve(
         policy,
         names,
         robot.arm_joints,
-        robot.gripper.max_width_m,
+        robot.max_width_m,
         home_reference(loaded) if "pose" in policy.spec.observation.state else IDENTITY,
     )
     logging.basicConfig(level=logging.WARNING, format="%(message)s")

@@ -134,10 +134,15 @@ class LeaderPolicy:
             observation=ObservationSpec(
                 cameras=(), state=(self._follow.state, "gripper"), prompt=False
             ),
-            action=self._follow.action,
+            action=self._follow.action.model_copy(
+                update={"gripper": "none" if profile.robot.gripper is None else "absolute_m"}
+            ),
         )
         self._name, self._path, self._now_s = name, path, now_s
-        self._max_width_m = profile.robot.gripper.max_width_m
+        self._grips, self._max_width_m = (
+            profile.robot.gripper is not None,
+            profile.robot.max_width_m,
+        )
         self._leads = False
         self._width_m = 0.0
         self._leader_width_m: float | None = None
@@ -164,7 +169,8 @@ class LeaderPolicy:
         columns = np.array([state.position_rad for state in path]).T
         joints_rad = np.column_stack([np.interp(times_s, stamps, column) for column in columns])
         width_m = self._width(path[-1].width_m) if leads else self._width_m
-        steps = [[*self._follow.step(each), width_m] for each in joints_rad]
+        width = [width_m] if self._grips else []
+        steps = [[*self._follow.step(each), *width] for each in joints_rad]
         return ActionSteps(steps, raw={"leader_rad": path[-1].position_rad.tolist()})
 
     def _width(self, leader_m: float | None) -> float:

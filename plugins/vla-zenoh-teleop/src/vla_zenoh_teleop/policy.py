@@ -113,26 +113,27 @@ class TeleopPolicy:
         *,
         frame: Frame = "base",
     ) -> None:
-        action = ActionSpec(
-            horizon=HORIZON,
-            dt_s=DT_S,
-            kind="delta",
-            frame=frame,
-            rotation="rotvec",
-            gripper="absolute_m",
-        )
+        parts = {part: profile.of_part(part).robot for part in profile.part_names}
+        actions = {
+            part: ActionSpec(
+                horizon=HORIZON,
+                dt_s=DT_S,
+                kind="delta",
+                frame=frame,
+                rotation="rotvec",
+                gripper="none" if robot.gripper is None else "absolute_m",
+            )
+            for part, robot in parts.items()
+        }
         self.spec = ModelSpec(
             name=PERSON,
             observation=ObservationSpec(cameras=(), state=("pose", "gripper"), prompt=False),
-            action=ActionSpec.of_parts(dict.fromkeys(profile.parts, action))
-            if profile.parts
-            else action,
+            action=ActionSpec.of_parts(actions) if profile.parts else actions[""],
         )
         self.speeds = speeds_of(profile)
         self.last = OperatorInput()
         self._name, self._read, self._level = name, read, level
-        parts = {part: profile.of_part(part).robot for part in profile.parts or ("",)}
-        self._max_width_m = {part: robot.gripper.max_width_m for part, robot in parts.items()}
+        self._max_width_m = {part: robot.max_width_m for part, robot in parts.items()}
         self._parts = tuple(parts)
         self._width_m: dict[str, float] = {}
 
@@ -170,7 +171,7 @@ class TeleopPolicy:
         toggled: bool,
         active: bool,
     ) -> FloatArray:
-        """(H, 7) steps of one part."""
+        """(H, 7) steps of one part; (H, 6) without a gripper."""
         gripper = observation.parts[part].gripper if part else observation.gripper
         assert gripper is not None
         opening, most_m = wanted.opening if active else 0.0, self._max_width_m[part]
@@ -193,7 +194,7 @@ class TeleopPolicy:
             self._width_m[part] = float(np.clip(width_m + moved_m, 0.0, most_m))
         steps = np.empty((count, AXES + 1))
         steps[:, :AXES], steps[:, AXES] = motion, widths_m
-        return steps
+        return steps[:, :AXES] if math.isnan(most_m) else steps
 
     def describe(self) -> str:
         """Speed and input, for a status line."""

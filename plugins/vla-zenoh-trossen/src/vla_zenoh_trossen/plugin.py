@@ -49,7 +49,10 @@ def _make(profile: Profile, options: TrossenOptions) -> TrossenArm:
 def _contradictions(profile: Profile, options: TrossenOptions) -> Iterator[Fault]:
     if len(profile.robot.arm_joints) != ARM_JOINTS:
         yield ("robot", "arm_joints"), "has not the six joints of a WidowX AI"
-    width_m = profile.robot.gripper.max_width_m
+    width_m = profile.robot.max_width_m
+    if options.end_effector != "no_gripper" and profile.robot.gripper is None:
+        wants = "gripper: {max_width_m: ...}, or trossen: {end_effector: no_gripper}"
+        yield ("robot",), f"declares no gripper, and trossen.end_effector has one: give {wants}"
     if options.end_effector != "no_gripper" and width_m > 2 * STROKE_M:
         yield (
             ("robot", "gripper", "max_width_m"),

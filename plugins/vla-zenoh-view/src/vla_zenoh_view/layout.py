@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -25,7 +26,7 @@ def blueprint(
 
     Args:
         seen: worker -> cameras that its model uses.
-        widest_mm: largest opening of the gripper.
+        widest_mm: largest opening of the gripper; NaN: there is none.
     """
     views = _camera_views(cameras, seen)
     above: Any = _scene()
@@ -98,10 +99,11 @@ def _camera_views(cameras: Collection[str], seen: Mapping[str, Collection[str]])
 
 def _plots(widest_mm: float) -> Any:
     wide = (-0.05 * widest_mm, 1.05 * widest_mm)
+    gripper = _plot("Gripper, mm: commanded orange, measured blue", paths.GRIPPER, span=wide)
     return rrb.Grid(
         _plot("Latency, ms: all grey, camera blue, model pink", paths.LATENCY),
         _plot("Speed, mm/s: commanded orange, measured blue", paths.SPEED),
-        _plot("Gripper, mm: commanded orange, measured blue", paths.GRIPPER, span=wide),
+        *([] if math.isnan(widest_mm) else [gripper]),
         _plot("Commanded to measured, mm", paths.TRACKING),
         _plot("Speed left by limits, %", paths.BOUNDS, span=SHARE_RANGE),
         _plot("Joints, rad", paths.JOINTS),

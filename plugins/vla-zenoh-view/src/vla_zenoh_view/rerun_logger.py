@@ -106,7 +106,7 @@ class RerunLogger:
         self._specs: dict[str, ModelSpec] = {}
         self._waiting: deque[tuple[str, int, ActionChunk]] = deque()
         self._obeyed = profile.task.worker
-        self._widest_mm = profile.robot.gripper.max_width_m * 1e3
+        self._widest_mm = profile.robot.max_width_m * 1e3
         self._cameras: set[str] = set()
         self._seen: defaultdict[str, set[str]] = defaultdict(set)
         self._layout()
@@ -184,8 +184,9 @@ class RerunLogger:
                 arm.charts.joints(state.names, state.position_rad)
             case GripperState() as state:
                 arm = self._arm(sample)
-                arm.scene.gripper(max(state.width_m, 0.0))
-                arm.charts.gripper(paths.MEASURED, state.width_m)
+                if state.width_m is not None:
+                    arm.scene.gripper(max(state.width_m, 0.0))
+                    arm.charts.gripper(paths.MEASURED, state.width_m)
             case ObjectPoses() as objects:
                 self._first.scene.objects(objects)
             case PoseCommand() as command:

@@ -57,7 +57,8 @@ class RobotMeshes:
         }
         signs = self.kinematics.finger_signs.tolist()
         self._finger_signs = dict(zip(robot.finger_joints, signs, strict=True))
-        self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
+        gripper = robot.gripper
+        self._fingers = gripper and Fingers(gripper, len(robot.finger_joints))
         self._shapes = _load_shapes(self.kinematics.urdf)
         links = dict.fromkeys(link for link, _, _ in self._shapes)
         self._cameras = {
@@ -115,6 +116,8 @@ class RobotMeshes:
 
     def open(self, width_m: float) -> None:
         """Open all fingers equally to a width."""
+        if self._fingers is None:
+            return
         position = self._fingers.position(width_m)
         self.move({name: sign * position for name, sign in self._finger_signs.items()})
 

@@ -137,7 +137,9 @@ class PartStreams:
             found["goal_m"] = rounded([command.goal_position_m])[0]
         gripper = self._recent(GripperState, now_s)
         if gripper is not None:
-            found |= {"width_m": round(gripper.width_m, 4), "holding": gripper.holding}
+            width_m = gripper.width_m
+            found["width_m"] = None if width_m is None else round(width_m, 4)
+            found["holding"] = gripper.holding
         if now_s - self._chunk[1] < CHUNK_S:
             found["chunk_m"] = self._chunk[0]
         try:

@@ -102,7 +102,7 @@ class Examination:
         self._rate_hz = rate_hz or (profile.task.rate_hz if profile else None)
         self._limits = profile.limits if profile else Limits()
         self._timing = profile.timing if profile else Timing()
-        self._width_m = profile.robot.gripper.max_width_m if profile else MAX_WIDTH_M
+        self._width_m = profile.robot.max_width_m if profile else MAX_WIDTH_M
         named = prompts or getattr(policy, "example_prompts", None)
         self._styles = example_styles(tuple(named) if named else PROMPTS)
         self._runs, self._budget_s = runs, budget_s

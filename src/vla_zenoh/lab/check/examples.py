@@ -180,12 +180,19 @@ class ExampleMaker:
         state: dict[str, Any] = {
             "joint": joint,
             "pose": PoseState(np.array(style.position_m), np.array(DOWN_XYZW), np.zeros(6)),
-            "gripper": GripperState(style.width_m, moving=False, holding=style.holding),
+            "gripper": self._gripper(style, part),
             "wrench": np.zeros(6),
             "effort": joint.effort_nm,
         }
         asked = [name for name in self.spec.observation.state if name in state]
         return {FIELD_OF.get(name, name): state[name] for name in asked}
+
+    def _gripper(self, style: ExampleStyle, part: str) -> GripperState:
+        profile = self.profile
+        known = profile is not None and part in profile.part_names
+        if known and profile.of_part(part).robot.gripper is None:
+            return GripperState(None, moving=False, holding=False)
+        return GripperState(style.width_m, moving=False, holding=style.holding)
 
     def _joint(self, part: str) -> JointState:
         # Those that the model moves, or seven made up.

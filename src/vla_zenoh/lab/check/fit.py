@@ -114,7 +114,7 @@ def _robot(profile: Profile, spec: ModelSpec, worker: str) -> Iterator[Finding]:
             f"{few_joints(profile)}: steps that it has no joint for are shortened, to nothing at "
             "worst (limit reach); `vla-zenoh profile check` names the axes",
         )
-    if spec.action.gripper == "none" and profile.robot.finger_joints:
+    if spec.action.gripper == "none" and profile.robot.gripper is not None:
         yield note("no_gripper", f"robot {profile.robot.name!r} has a gripper, the model none")
     if spec.observation.prompt and not profile.task.prompt:
         yield warning("no_prompt", "needs a prompt; task.prompt of the profile is empty")

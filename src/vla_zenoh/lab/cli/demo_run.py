@@ -13,7 +13,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.cli.demo_stage import Stage, latencies, open_stage, print_end
 from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import print_json
-from vla_zenoh.lab.demo.scripted_motions import ScriptedPrompt, parse_scripted
+from vla_zenoh.lab.demo.scripted_motions import GRIPPER_AXIS, ScriptedPrompt, parse_scripted
 from vla_zenoh.lab.episode import EpisodeRunner
 from vla_zenoh.lab.evaluation.result import PromptSegment
 from vla_zenoh.lab.evaluation.tables import SEGMENT_COLUMNS, segment_rows
@@ -27,7 +27,6 @@ SETTLE_S = 0.8
 SLACK_S = 15.0
 EXACT_M, EXACT_RAD = 0.002, 0.005
 """A fixed motion that is off by more was not done: distance, angle, drift and a gripper's width."""
-GRIPPER_AXIS = 6
 
 
 def run_demo(prompt: str, steps: int, profile: str, given: DemoOptions) -> None:
@@ -54,7 +53,7 @@ def run_demo(prompt: str, steps: int, profile: str, given: DemoOptions) -> None:
         (found,) = stage.draw(run)
         segment = next(each for each in found.segments if each.prompt == asked)
         found.segments = [replace(segment, requests=done)]  # not those after its end
-        width_m = stage.profile.robot.gripper.max_width_m
+        width_m = stage.profile.robot.max_width_m
         faults = faults_of(segment, parse_scripted(asked), width_m)
         if done != steps:
             faults.append(f"{done} of {steps} steps were executed")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +10,7 @@ import typer
 from rich.syntax import Syntax
 
 from vla_zenoh.cli.options import (
+    PROFILE_VARIABLE,
     ConnectOption,
     HostOption,
     JsonOption,
@@ -63,7 +65,12 @@ def show(
 
 
 def check(
-    names: Annotated[list[str], typer.Argument(help="Names or paths of profiles.", metavar="NAME")],
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help=f"Names or paths of profiles; default: {PROFILE_VARIABLE}.", metavar="NAME"
+        ),
+    ] = None,
     host: HostOption = None,
     connect: ConnectOption = None,
     listen: ListenOption = None,
@@ -76,6 +83,9 @@ def check(
     What only one host needs (files, meshes, packages) is an error on that host, which --host names
     if there are several, and advice elsewhere. Exits with 1 when a profile cannot run.
     """
+    names = names or list(filter(None, [os.environ.get(PROFILE_VARIABLE)]))
+    if not names:
+        fail(f"give NAME, a profile, or set {PROFILE_VARIABLE}")
     reports = {name: check_profile(name, host, connect, listen, sim=sim) for name in names}
     if as_json:
         print_json({name: report._asdict() for name, report in reports.items()})

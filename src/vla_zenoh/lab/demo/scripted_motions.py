@@ -16,6 +16,7 @@ from vla_zenoh.errors import SpecError
 
 STEP_M, STEP_RAD, STEP_WIDTH_M = 0.01, 0.05, 0.05
 MAX_COUNT = 100_000
+GRIPPER_AXIS = 6
 
 
 class ScriptedMotion(NamedTuple):

@@ -145,7 +145,7 @@ def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
     _requests(out, obeyed, causes, zero_ns)
     measured, commanded = _stream(run.poses, zero_ns), _commanded(run, zero_ns)
     _motion(out, measured, commanded)
-    out.width_m = np.array([entry.record.width_m for entry in run.grippers])
+    out.width_m = np.array([entry.record.opening_m for entry in run.grippers])
     out.width_t_s = np.array([(e.header.stamp_wall_ns - zero_ns) / 1e9 for e in run.grippers])
     _seams(out, run.commands)
     _jerk(out, run)

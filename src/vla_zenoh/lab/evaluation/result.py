@@ -279,7 +279,7 @@ class Evaluation:
             "refusals": dict(sorted(self.refusals.items())),
             "skipped": dict(sorted(self.skipped.items())),
             "gripper_width_m": None
-            if not len(self.width_m)
+            if not np.isfinite(self.width_m).any()
             else {
                 "first": float(self.width_m[0]),
                 "last": float(self.width_m[-1]),

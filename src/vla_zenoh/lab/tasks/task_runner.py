@@ -106,7 +106,7 @@ class TaskRunner:
 
     def scene(self) -> SceneSnapshot:
         header, objects = self._states.read(ObjectPoses)
-        width_m = self._states.read(GripperState)[1].width_m
+        width_m = self._states.read(GripperState)[1].opening_m
         tcp_m = self._states.read(PoseState)[1].position_m
         return SceneSnapshot(header.stamp_wall_ns, objects, width_m, tcp_m)
 

@@ -331,7 +331,7 @@ class CommandStatus:
             part.motion.failures for part in commander.parts
         )
         self._node.counters["command.gripper_timeouts"] = sum(
-            part.gripper.timeouts for part in commander.parts
+            part.gripper.timeouts for part in commander.parts if part.gripper
         )
         self._node.counters["command.chunks_dropped"] = chunks_dropped
         self._node.publish_status(
@@ -395,7 +395,8 @@ def _part_detail(part: CommandedPart) -> dict[str, Any]:
         quat_xyzw = quat_from_rotation(goal.pose.rotation)
         detail["goal_m"] = [round(float(value), 6) for value in goal.pose.position_m]
         detail["goal_quat_xyzw"] = [round(float(value), 6) for value in quat_xyzw]
-        detail["goal_width_m"] = round(goal.width_m, 5)
+        if part.gripper is not None:
+            detail["goal_width_m"] = round(goal.width_m, 5)
     if reach is not None and goal is not None:
         room = reach.margins
         detail["joint_margin_rad"] = round(room.joint_rad, 4)

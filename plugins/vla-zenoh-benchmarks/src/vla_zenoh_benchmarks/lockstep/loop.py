@@ -100,7 +100,9 @@ class Lockstep:
         self.events: list[Event] = []
         self.refused: Counter[str] = Counter()
         self._gripper_guards = {
-            name: GripperGuard(profile.of_part(name).robot.gripper) for name in self.guards
+            name: GripperGuard(gripper)
+            for name in self.guards
+            if (gripper := profile.of_part(name).robot.gripper) is not None
         }
         self.guard_refused: Counter[str] = Counter()
         policies = {profile.task.worker: policy, **(others or {})}
@@ -226,7 +228,7 @@ class Lockstep:
         self.trace.parts.append(out.parts)
         self.trace.position_m.append(position_m)
         self.trace.rotation.append(rotation)
-        self.trace.width_m.append(self.world.gripper_state().width_m)
+        self.trace.width_m.append(self.world.gripper_state().opening_m)
 
     def _publish(self, out: Outputs) -> None:
         self.events += out.events

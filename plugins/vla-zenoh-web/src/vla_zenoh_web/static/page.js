@@ -154,7 +154,7 @@ function showState(message) {
     ["why", message.why.replace(/'web-(.+?)-[0-9a-f]+'/g, "$1")],
     ["held by", message.you_hold ? "you" : message.holder ? message.holder : task && task.active ? "nobody: it runs without a hold" : "nobody"],
     ["arm", `${message.at_rest === null ? "unknown" : message.at_rest ? "stands" : "moves"}, ${(fastest * 100).toFixed(1)} cm/s`],
-    ...arms.map(([name, arm]) => [`gripper ${name}`.trim(), arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}${arm.holds ? `, counted as a box of ${arm.holds} m` : ""}`]),
+    ...arms.map(([name, arm]) => [`gripper ${name}`.trim(), arm.width_m === undefined ? "" : arm.width_m === null ? "none" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}${arm.holds ? `, counted as a box of ${arm.holds} m` : ""}`]),
     ["limits", message.limits.join("; ")],
   ]);
   showPeople(message.people);
@@ -162,8 +162,9 @@ function showState(message) {
   keepTrend(message, fastest);
   $("take").setAttribute("aria-pressed", String(message.jog === true));
   setText($("take"), message.jog ? "Hand back" : "Take the arm");
-  for (const button of $("pad").children) button.disabled = !message.jog;
-  for (const button of $("primitives").children) button.disabled = !message.primitives;
+  const grips = typeof (message.arms?.[$("part").value] || {}).width_m === "number";
+  for (const button of $("pad").children) button.disabled = !message.jog || (button.dataset.gripper && !grips);
+  for (const button of $("primitives").children) button.disabled = !message.primitives || (button.dataset.gripper && !grips);
   setText($("primitives-words"), message.primitives ? "They move while the button is pressed, from an arm that stands." : "They need the node primitives: `vla-zenoh node primitives`.");
   $("save").disabled = !message.rolling || !welcome.drives;
   streams(message.seen || []);
@@ -345,11 +346,13 @@ for (const [way, name] of WAYS) {
 }
 for (const [name, size] of [["open gripper", 1], ["close gripper", -1]]) {
   const button = el("button", name, { disabled: true });
+  button.dataset.gripper = name;
   holdable(button, () => beginHold(NONE, size));
   $("pad").append(button);
 }
 for (const [name, what] of [["Home", "home"], ["Open", "open"], ["Close", "closed"]]) {
   const button = el("button", name, { disabled: true });
+  if (what !== "home") button.dataset.gripper = what;
   holdable(button, () => beginHold(NONE, 0, what));
   $("primitives").append(button);
 }
