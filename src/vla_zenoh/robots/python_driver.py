@@ -116,9 +116,8 @@ class PythonDriver(RobotDriver):
         gripper = measured.gripper
         assert gripper is not None
         self.measured_ns, self._width_m = measured_ns, gripper.width_m
-        if (
-            gripper.width_m is not None and not gripper.moving
-        ):  # while the fingers move nobody knows
+        # While the fingers move nobody knows.
+        if gripper.width_m is not None and not gripper.moving:
             self._set_held(gripper.width_m, holding=gripper.holding)
         self._rate.tick()
         return measured

@@ -146,7 +146,8 @@ def robot_model(robot: RobotProfile) -> RobotModel:
     """
     shipped = {model.description: model for model in (RobotModel(), SO101)}
     described = WITH_MESHES.get(robot.description, robot.description)
-    found = shipped.get(described) or _any_arm(robot)
+    # Of a shipped description the fingers move, whatever the profile names.
+    found = (shipped.get(described) if robot.gripper else None) or _any_arm(robot)
     return replace(
         found,
         description=robot.description,

@@ -116,7 +116,7 @@ def _gripper(file: Path, links: Structure, answers: Answers) -> Gripper:
     names = tuple(found.values) or ("max_width_m",)
     what = f"{', '.join(names)} of {', '.join(found.joints)}"
     if not found.joints:
-        what = "no joint of a finger was found: the robot has no gripper"
+        what = f"{found.why or 'no joint of a finger was found'}: the robot has no gripper"
     values = answers.numbers(
         "gripper", list(found.values.values()), "robot.gripper", what, (len(names), 0)
     )

@@ -139,10 +139,8 @@ class LeaderPolicy:
             ),
         )
         self._name, self._path, self._now_s = name, path, now_s
-        self._grips, self._max_width_m = (
-            profile.robot.gripper is not None,
-            profile.robot.max_width_m,
-        )
+        self._grips = profile.robot.gripper is not None
+        self._max_width_m = profile.robot.max_width_m
         self._leads = False
         self._width_m = 0.0
         self._leader_width_m: float | None = None
