@@ -56,8 +56,6 @@ class Scripted:
         profile: of the robot; one without a gripper gets no number for it.
     """
 
-    example_prompts = ("HARD: go up", "HARD: yaw left", "HARD: close gripper", "hold")
-
     def __init__(
         self,
         camera: str = "front",
@@ -68,6 +66,8 @@ class Scripted:
         profile: str = "",
     ) -> None:
         self._no_gripper = load_profile(profile).robot.no_gripper if profile else ""
+        grips = () if self._no_gripper else ("HARD: close gripper",)
+        self.example_prompts = ("HARD: go up", "HARD: yaw left", *grips, "hold")
         cameras = tuple(CameraSpec(camera=name) for name in camera.split(",") if name)
         self.spec = ModelSpec(
             name="scripted",

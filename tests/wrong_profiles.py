@@ -448,7 +448,7 @@ CHECKED: list[tuple[str, str]] = [
     (
         "options: {scripted: {camra: front}}",
         "lab.yaml:2: options.scripted: {models}/scripted.py: Scripted has no option 'camra'; did y"
-        "ou mean 'camera'? Its options: camera, horizon, dt_s, delay_ms, jitter",
+        "ou mean 'camera'? Its options: camera, horizon, dt_s, delay_ms, jitter, profile",
     ),
     (
         "options: {scripted: {horizon: many}}",
