@@ -17,7 +17,6 @@ from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.policy_check import spec_errors
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.lab.profile.robot_check import _fingers_advice
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.robot import Reading
@@ -77,7 +76,3 @@ def test_no_width_is_made_up(state: Callable[[], Any]) -> None:
 
 def test_a_commanded_arm_has_no_gripper_to_send_to() -> None:
     assert CommandedPart(ur5("pose"), None).gripper is None
-
-
-def test_profile_check_says_that_there_is_none() -> None:
-    assert "no gripper" in " ".join(_fingers_advice(BARE, 0.0))

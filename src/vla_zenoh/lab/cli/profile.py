@@ -94,7 +94,8 @@ def check(
             errors().print(line, style="red", soft_wrap=True)
         if report.errors:
             continue
-        console().print(styled("ok", "green"), name, soft_wrap=True)
+        bare = "" if load_profile(name).robot.gripper else ": no gripper"
+        console().print(styled("ok", "green"), f"{name}{bare}", soft_wrap=True)
         for line in report.advice:
             errors().print(styled("advice", "yellow"), line, soft_wrap=True)
     if any(report.errors for report in reports.values()):

@@ -197,10 +197,7 @@ def _axes_advice(kinematics: Kinematics) -> Iterator[str]:
 def _fingers_advice(profile: Profile, described_m: float) -> Iterator[str]:
     """Advice where the sliding fingers of the description do not add up to the width."""
     gripper = profile.robot.gripper
-    if gripper is None:
-        yield f"robot.gripper: {profile.robot.no_gripper}"
-        return
-    if gripper.joint_ends is not None or not profile.robot.finger_joints:
+    if gripper is None or gripper.joint_ends is not None or not profile.robot.finger_joints:
         return
     share = described_m / gripper.max_width_m
     if not 1 / WIDTHS < share < WIDTHS:
