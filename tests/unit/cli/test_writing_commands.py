@@ -48,6 +48,8 @@ LOGS = {"up log_dir", "node rolling folder"}
 EDITED = {"camera calibrate write", "canary promote file", "canary back file"}
 """A profile in which keys are set; a backup is kept: `tests/unit/lab/test_calibrate_command.py`.
 The file of a canary, which is told who was promoted: `tests/unit/lab/test_canary.py`."""
+SECOND = {"profile new drawn"}
+"""Beside the output, and as it: `MORE`."""
 CERTIFICATES = {"secure init folder", "secure here folder", "secure show folder"}
 """Folders whose files only ``secure add --renew`` replaces; see `tests/unit/security`."""
 NAMED = ("file", "folder", "out", "save", "into", "directory")
@@ -175,7 +177,7 @@ def test_every_path_of_a_command_is_read_or_is_its_output() -> None:
         for each in command.params:
             path = "Path" in str(each.type_descriptor.annotation) or each.name in NAMED
             if path and "--output" not in each.opts:
-                assert f"{name} {each.name}" in READ | EDITED | CERTIFICATES | LOGS, (
+                assert f"{name} {each.name}" in READ | EDITED | SECOND | CERTIFICATES | LOGS, (
                     "outputs are called --output"
                 )
 

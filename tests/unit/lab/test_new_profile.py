@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from described_arms import SEVEN, SIX, TOOL, Row, X, Y, arm, finger, urdf
+from typer.testing import CliRunner
 from vla_zenoh_newarm.answers import Answers
 from vla_zenoh_newarm.arm import Arm, JointMotion
 from vla_zenoh_newarm.gripper import Gripper, gripper
@@ -22,7 +23,9 @@ from vla_zenoh_newarm.structure import structure
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.description import Description
 from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.program.main import app
 
+SHIPPED = Path(__file__).parents[3] / "profiles"
 JOINTS_6 = tuple(f"j{n}" for n in range(1, 7))
 OPTIONS = ("base", "tcp", "home", "workspace", "table", "acceleration", "jerk", "gripper")
 
@@ -303,3 +306,13 @@ def test_the_picture_shows_every_joint_and_the_tcp_where_kinematics_has_it(tmp_p
         px_m = np.ptp(corners_px[:, 0]) / np.ptp(box[right])
         apart_m = (px["TCP"] - px["base"]) / (px_m, -px_m)
         np.testing.assert_allclose(apart_m, tcp[[right, up]], atol=1e-3)
+
+
+def test_a_picture_that_exists_is_kept_and_no_profile_is_written(tmp_path: Path) -> None:
+    old, profile = tmp_path / "arm.svg", tmp_path / "arm.yaml"
+    old.write_text("mine")
+    words = ["profile", "new", str(SHIPPED / "ur5e.urdf"), "-o", str(profile), "--yes"]
+    done = CliRunner().invoke(app, [*words, "--picture", str(old)])
+    assert done.exit_code == 1
+    assert "arm.svg exists" in str(done.exception or done.stderr)
+    assert (old.read_text(), list(tmp_path.iterdir())) == ("mine", [old])

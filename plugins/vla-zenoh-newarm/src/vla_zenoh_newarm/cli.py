@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -99,7 +100,12 @@ def new(
     name = _name(output or source)
     file = output or Path(f"{name}.yaml")
     copy = file.with_name(f"{file.stem}_mended.urdf")
-    with output_file(file, force=force, inputs=[source]) as part:
+    with ExitStack() as outputs:
+        part, *sketch = (
+            outputs.enter_context(output_file(each, force=force, inputs=[source]))
+            for each in (file, drawn)
+            if each is not None
+        )
         for made in (copy, meshes_of(copy)):
             if made.exists() and not force:
                 raise OutputError(f"{made} exists; give another --output, or --force to replace it")
@@ -115,9 +121,8 @@ def new(
         path = named or os.path.relpath(arm.file.resolve(), file.resolve().parent)
         text = profile_text(name, description, path, arm)
         part.write_text(text, "utf-8")
-    if drawn is not None:
-        with output_file(drawn, force=force, inputs=[source]) as part:
-            part.write_text(picture(name, arm), "utf-8")
+        for each in sketch:
+            each.write_text(picture(name, arm), "utf-8")
     _report(file, arm, as_json)
 
 
