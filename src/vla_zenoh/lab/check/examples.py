@@ -189,10 +189,13 @@ class ExampleMaker:
 
     def _gripper(self, style: ExampleStyle, part: str) -> GripperState:
         profile = self.profile
-        known = profile is not None and part in profile.part_names
-        if known and profile.of_part(part).robot.gripper is None:
+        if profile is None or part not in profile.part_names:
+            width_m: float | None = style.width_m
+        else:
+            width_m = style.width_m if profile.of_part(part).robot.gripper is not None else None
+        if width_m is None:
             return GripperState(None, moving=False, holding=False)
-        return GripperState(style.width_m, moving=False, holding=style.holding)
+        return GripperState(width_m, moving=False, holding=style.holding)
 
     def _joint(self, part: str) -> JointState:
         # Those that the model moves, or seven made up.
