@@ -72,7 +72,12 @@ class Bench:
         chain = self.chain
         middle_m = 0.42
         prompt = "HARD: go up" if chain.height_m() < middle_m else "HARD: go down"
-        assert self.start(peer, prompt)["result"]["reason"] == "started"
+
+        def started() -> bool:  # as soon as its order before is over, see `heard`
+            found = self.start(peer, prompt)
+            return found.get("result", found)["reason"] == "started"
+
+        chain.until("its order starts", started, 10)
         chain.until("it moves", chain.moves)
 
     def seconds_until(self, what: str, ask: Callable[[], Any]) -> float:

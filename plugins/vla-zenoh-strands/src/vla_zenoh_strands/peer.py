@@ -279,7 +279,7 @@ class Peer:
             raise RefusalError("busy", "the arm is active by somebody at this robot")
         order = self._mandate.judge(command, time.time(), time.monotonic())
         self._cancelled.clear()
-        if self._latched:
+        if self._latched or self._mode()[0] == "stopped":
             self._mandate.end()
             raise RefusalError("stopped", "its emergency stop is latched; a person resets it here")
         what = f"strands-{command.sender}"
