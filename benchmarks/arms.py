@@ -159,7 +159,9 @@ def _moved(file: Path) -> str:
     except VlaZenohError as error:
         return str(error)
     reach = ReachabilityFilter(profile)
-    loop = Lockstep(profile, world, make_policy(find_model("scripted")), reach=reach)
+    loop = Lockstep(
+        profile, world, make_policy(find_model("scripted"), profile=str(file)), reach=reach
+    )
     start_m = world.tcp()[0]
     loop.put("prompt", f"HARD: go up x{STEPS}")
     loop.run(0.2)

@@ -12,7 +12,7 @@ from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.program.main import app
 from vla_zenoh.simulation.world import World, build_world
 
@@ -33,18 +33,20 @@ def new(folder: Path, text: str, *words: str) -> tuple[int, str, Path]:
     return done.exit_code, done.output, file
 
 
-def loop_of(profile: Profile) -> tuple[Lockstep, World]:
+def loop_of(file: Path) -> tuple[Lockstep, World]:
     # Slow nodes: only where the arm ends up matters.
-    slow = override(profile, {"timing": {"command_hz": 50, "state_hz": 50}})
+    slow = override(load_profile(str(file)), {"timing": {"command_hz": 50, "state_hz": 50}})
     world = build_world(slow)
     reach = ReachabilityFilter(slow)
-    loop = Lockstep(slow, world, make_policy(find_model("scripted")), reach=reach)
+    loop = Lockstep(
+        slow, world, make_policy(find_model("scripted"), profile=str(file)), reach=reach
+    )
     return loop, world
 
 
-def moved_m(profile: Profile) -> tuple[str, list[float]]:
+def moved_m(file: Path) -> tuple[str, list[float]]:
     """Why the arm is not activated, or how far up it goes by two prompts."""
-    loop, world = loop_of(profile)
+    loop, world = loop_of(file)
     ways_m: list[float] = []
     for motion in ("go up", "go down"):
         start_m = world.tcp()[0]
@@ -79,7 +81,7 @@ AT_ONCE = {"six joints", "a torso that lifts", "knuckles that turn against each 
 def test_a_made_profile_moves_its_simulated_arm(tmp_path: Path, name: str) -> None:
     code, output, file = new(tmp_path, urdf(TAKEN[name].rows))
     assert code == 0, output
-    why, ways_m = moved_m(load_profile(str(file)))
+    why, ways_m = moved_m(file)
     assert why == ""
     assert ways_m == pytest.approx([WAY_M, -WAY_M], abs=EXACT_M)
 
@@ -95,7 +97,7 @@ def test_an_arm_whose_description_has_weak_motors_does_not_fall(tmp_path: Path) 
     weak = urdf(TAKEN["six joints"].rows).replace('effort="10"', 'effort="0.01"')
     code, output, file = new(tmp_path, weak)
     assert code == 0, output
-    why, ways_m = moved_m(load_profile(str(file)))
+    why, ways_m = moved_m(file)
     assert why == ""
     assert ways_m == pytest.approx([WAY_M, -WAY_M], abs=EXACT_M)
 

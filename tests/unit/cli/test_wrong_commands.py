@@ -65,7 +65,7 @@ WRONG: list[tuple[str, int, str]] = [
         FAILED,
         "session.connect: leads to tcp/127.0.0.1:7448, and the router of this host listens on",
     ),
-    ("profile check", USAGE, "Missing argument 'NAME'"),
+    ("profile check", USAGE, "give NAME, a profile, or set VLA_ZENOH_PROFILE"),
     ("profile check nosuch", FAILED, "no profile called 'nosuch'. Known: "),
     ("profile check panda_sim --host desk", FAILED, "hosts: has no 'desk'. It has: here"),
     ("profile show nosuch", FAILED, "error: no profile called 'nosuch'. Known: "),

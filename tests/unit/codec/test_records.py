@@ -260,7 +260,7 @@ HEADER_REASONS = {"schema", "invalid", "malformed"}
         (JOINT_COMMAND, {"state": 1}, "state is 1, allowed: text of at most 32 characters"),
         (GRIPPER, {"faults": "fire"}, "faults is 'fire', allowed: a list of"),
         (GRIPPER, {"faults": [b"fire"]}, r"faults\[0\] is b'fire'"),
-        (GRIPPER, {"width_m": 40}, "width_m is 40, allowed: a number from -0.01 to 1"),
+        (GRIPPER, {"width_m": 40}, "width_m is 40, allowed: null or a number from -0.01 to 1"),
         (STATUS, {"rates_hz": {"a": float("nan")}}, "rates_hz.a is nan, allowed: a finite number"),
         (STATUS, {"counters": {"b": 1, "a": 1.5}}, "counters.a is 1.5, allowed: a whole number"),
         (STATUS, {"counters": {b"a": 1}}, "a name in counters is wrong"),

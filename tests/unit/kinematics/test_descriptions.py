@@ -319,6 +319,7 @@ robot:
   tcp_frame: tcp
   arm_joints: [{joints}]
   finger_joints: [{fingers}]
+  gripper: {gripper}
   home_rad: [{home}]
   {more}
 limits: {{workspace: {{x_m: [-1, 1], y_m: [-1, 1], z_m: [0, 2]}}, reach: {{table_z_m: null}}}}
@@ -348,7 +349,13 @@ def checked(
     (folder / "my_arm.py").write_text(ARM)
     home = ", ".join(str(round(0.1 * n, 1)) for n in range(1, len(joints) + 1))
     (folder / "lab.yaml").write_text(
-        PROFILE.format(joints=", ".join(joints), fingers=", ".join(fingers), home=home, more=more)
+        PROFILE.format(
+            joints=", ".join(joints),
+            fingers=", ".join(fingers),
+            gripper="{max_width_m: 0.08}" if fingers else "null",
+            home=home,
+            more=more,
+        )
     )
     report = check_profile(str(folder / "lab.yaml"))
     return "\n".join(report.errors), "\n".join(report.advice)

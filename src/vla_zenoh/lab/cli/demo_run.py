@@ -19,7 +19,6 @@ from vla_zenoh.lab.evaluation.result import PromptSegment
 from vla_zenoh.lab.evaluation.tables import SEGMENT_COLUMNS, segment_rows
 from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.lab.recording.run import Run
-from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.types import GripperState, PoseState
 
 SETTLE_S = 0.8
@@ -134,15 +133,16 @@ def _carry_out(stage: Stage, prompt: str, steps: int, rate_hz: float) -> int:
 
 def _write_chunks(stage: Stage, run: Run) -> None:
     """Chunk file for ``vla-zenoh worker replay``: spec, steps (N, H, D), length (N,)."""
-    profile = stage.profile
-    worker = profile.task.worker
-    spec = make_policy(find_worker(worker, profile.models)[1], profile.options.get(worker)).spec
+    worker = stage.profile.task.worker
     obeyed = {cause.chunk_seq for cause, _ in run.first_commands() if cause.worker == worker}
-    chunks = [
-        entry.record.steps
+    answers = [
+        entry.record
         for entry in run.chunks
         if entry.record.worker == worker and entry.header.seq in obeyed
     ]
+    if not answers:
+        return
+    spec, chunks = run.specs[answers[0].spec_hash], [answer.steps for answer in answers]
     steps = np.zeros((len(chunks), spec.action.horizon, spec.action.dimension), np.float32)
     for index, chunk in enumerate(chunks):
         steps[index, : len(chunk)] = chunk

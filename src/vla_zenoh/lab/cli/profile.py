@@ -85,7 +85,7 @@ def check(
     """
     names = names or list(filter(None, [os.environ.get(PROFILE_VARIABLE)]))
     if not names:
-        fail(f"give NAME, a profile, or set {PROFILE_VARIABLE}")
+        raise typer.BadParameter(f"give NAME, a profile, or set {PROFILE_VARIABLE}")
     reports = {name: check_profile(name, host, connect, listen, sim=sim) for name in names}
     if as_json:
         print_json({name: report._asdict() for name, report in reports.items()})

@@ -103,7 +103,7 @@ class Recording:
             for what, counts in missing.items():
                 counts.update(self._missing(what))
         if self.ended is not None:
-            self.ended |= missing
+            self.ended |= {what: dict(found) for what, found in missing.items() if found}
 
     def _entries_of(self, path: Path, wanted: Callable[[str], bool]) -> Iterator[Sample]:
         schemas: dict[int, Schema] = {}
