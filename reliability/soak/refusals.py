@@ -22,7 +22,15 @@ ASKED_EARLY: Reasons = {"command": frozenset({"activate_refused"})}
 OVERDUE: Reasons = {
     "command": frozenset({"stale", "expired", "future", "clock_step", "worker_refused"}),
     "sim": frozenset(
-        {"pose_late", "pose_braking", "pose_inactive", "pose_jump", "pose_too_fast", "clock_step"}
+        {
+            "pose_late",
+            "pose_stale",
+            "pose_braking",
+            "pose_inactive",
+            "pose_jump",
+            "pose_too_fast",
+            "clock_step",
+        }
     ),
     "camera": frozenset({"clock_step"}),
     "worker": frozenset({"clock_step"}),
