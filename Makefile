@@ -91,8 +91,9 @@ test-ros2: $(READY) ros2-bridge ros2-environment ## Run the tests with a real RO
 test-franka: $(READY) ## Run the tests of the driver franka against franka-sim, in an environment of its own
 	$(BIN)/python scripts/test_franka.py $(AGAIN) $(ARGS) || $(BIN)/python scripts/test_franka.py $(AT_THE_END) $(ARGS)
 
-test-rivals: $(READY) ## Run the tests against robots' packages of others on Zenoh, each in an environment of its own
-	$(BIN)/python scripts/test_rivals.py $(AGAIN) $(ARGS)
+RIVALS := $(if $(ONLY),--only $(ONLY))
+test-rivals: $(READY) ## Run the tests against robots' packages of others on Zenoh, each in an environment of its own; ONLY=r2c,trossen
+	$(BIN)/python scripts/test_rivals.py $(RIVALS) $(AGAIN) $(ARGS) || $(BIN)/python scripts/test_rivals.py $(RIVALS) $(AT_THE_END) $(ARGS)
 
 demo-rivals: $(READY) ## Two robots of others on one bus, an agent, a cut link; log and pictures into runs/rivals
 	$(BIN)/python scripts/test_rivals.py --demonstration runs/rivals

@@ -1,6 +1,6 @@
 """Tests against others' packages that put robots on Zenoh, each in an environment of its own.
 
-    .venv/bin/python scripts/test_rivals.py [PYTEST OPTIONS]
+    .venv/bin/python scripts/test_rivals.py [--only NAME,NAME] [PYTEST OPTIONS]
     .venv/bin/python scripts/test_rivals.py --demonstration FOLDER
 
 uv makes the environments in ``.tools/rivals``, once. Of physicalai only what its robots' transport
@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Collection
 from pathlib import Path
 
 from bootstrap import TOOLS, uv_environment
@@ -76,7 +77,8 @@ ENVIRONMENTS: tuple[tuple[str, str, tuple[str, ...], tuple[str, ...], str], ...]
     (INSPECT, "inspect", (), OF_INSPECT, sys.executable),
 )
 """Variable, folder, packages without what they need, packages with it, Python or its version."""
-SHOWN = (PHYSICALAI, TROSSEN)
+NAMES = tuple(name for _, name, *_ in ENVIRONMENTS)
+SHOWN = ("physicalai", "trossen")
 """What the demonstration needs."""
 
 
@@ -121,31 +123,34 @@ def library(uv: str, environ: dict[str, str], package: str) -> str:
     return str(folder)
 
 
-def make(environ: dict[str, str], *, demonstration: bool) -> None:
-    """Make the environments, and write into `environ` where they are.
+def make(environ: dict[str, str], names: Collection[str]) -> None:
+    """Make the environments of these `names`, and write into `environ` where they are.
 
-    Args:
-        environ: of the tests; what it names already is not made.
-        demonstration: only what that needs.
+    What `environ` names already is not made.
     """
     uv = str(Path(sysconfig.get_path("scripts")) / "uv")
     for variable, name, alone, needed, base in ENVIRONMENTS:
-        if variable not in environ and not (demonstration and variable not in SHOWN):
+        if name in names and variable not in environ:
             environ[variable] = environment(uv, environ, name, alone, needed, base)
-    paths = library(uv, environ, TROSSEN_ARM), environ.get("PYTHONPATH", "")
-    environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
-    if SIMULATOR not in environ and not demonstration:
+    if "trossen" in names:
+        paths = library(uv, environ, TROSSEN_ARM), environ.get("PYTHONPATH", "")
+        environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+    if "franka-node" in names and SIMULATOR not in environ:
         environ[SIMULATOR] = simulator_environment(uv, environ, *PACKAGES)
 
 
 def main() -> int:
     """Make the environments and run the tests, or the demonstration; the exit status."""
-    environ, given = uv_environment(os.environ), sys.argv[1:]
-    demonstration = given[:1] == ["--demonstration"]
-    make(environ, demonstration=demonstration)
-    if demonstration:
+    environ, given, names = uv_environment(os.environ), sys.argv[1:], NAMES
+    if given[:1] == ["--only"]:
+        names, given = tuple(given[1].split(",")), given[2:]
+        if unknown := set(names) - set(NAMES):
+            sys.exit(f"no environment {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
+    if given[:1] == ["--demonstration"]:
+        make(environ, SHOWN)
         command = [sys.executable, "tests/rivals/demonstration", *given[1:]]
     else:
+        make(environ, names)
         command = [sys.executable, "-m", "pytest", "-m", "rivals", "tests/rivals", *given]
     return subprocess.run(command, cwd=ROOT, env=environ, check=False).returncode
 

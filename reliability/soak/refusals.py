@@ -43,7 +43,7 @@ FROM_ROBOT: Reasons = {
 }
 FROM_COMMAND: Reasons = {
     "sim": BEGUN_ANEW
-    | {"pose_braking", "pose_inactive", "pose_jump", "pose_too_fast", "pose_foreign"},
+    | {"pose_braking", "pose_inactive", "pose_jump", "pose_too_fast", "pose_foreign", "pose_stale"},
     "worker": BEGUN_ANEW,
 }
 FROM_WORKER: Reasons = {"command": frozenset({"stale", "expired"}) | BEGUN_ANEW}
