@@ -126,13 +126,17 @@ def library(uv: str, environ: dict[str, str], package: str) -> str:
 def make(environ: dict[str, str], names: Collection[str]) -> None:
     """Make the environments of these `names`, and write into `environ` where they are.
 
-    What `environ` names already is not made.
+    What `environ` names already is not made. One that cannot be had is told, and its tests are
+    skipped.
     """
     uv = str(Path(sysconfig.get_path("scripts")) / "uv")
     for variable, name, alone, needed, base in ENVIRONMENTS:
         if name in names and variable not in environ:
-            environ[variable] = environment(uv, environ, name, alone, needed, base)
-    if "trossen" in names:
+            try:
+                environ[variable] = environment(uv, environ, name, alone, needed, base)
+            except subprocess.CalledProcessError:  # uv has said why
+                print(f"{name}: there is no environment, its tests are skipped", file=sys.stderr)
+    if TROSSEN in environ and "trossen" in names:
         paths = library(uv, environ, TROSSEN_ARM), environ.get("PYTHONPATH", "")
         environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     if "franka-node" in names and SIMULATOR not in environ:
