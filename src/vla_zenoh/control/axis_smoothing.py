@@ -142,6 +142,8 @@ class AxisSmoother:
     ) -> None:
         self._dt_s, self.box, self._groups, self._within = dt_s, box, groups, within
         self.failures = 0
+        self.failure = ""
+        """The last motion without a trajectory, in numbers that reproduce it."""
         self.stand(position)
 
     def stand(self, position: FloatArray) -> None:
@@ -213,12 +215,18 @@ class AxisSmoother:
         self._elapsed_s = 0.0
         if plan is None:
             self.failures += 1
+            self.failure = self._described()
             self.braking = True
             plan = self._stop(self.box, together=False)
         if plan is None:
             self.stand(self.state.position)
         else:
             self._plan = plan
+
+    def _described(self) -> str:
+        values = {**self.state._asdict(), "target": self._target, "jerk": self._jerk}
+        given = ", ".join(f"{name} {value.tolist()}" for name, value in values.items())
+        return f"{given}, time scale {self._time_scale!r}, limits {self.box.tolist()}"
 
     def _towards(
         self, way: FloatArray, limits: FloatArray, unreversed: FloatArray, all_to_stop: bool

@@ -41,6 +41,8 @@ from vla_zenoh.types import (
 
 PIECE_M, PIECE_RAD, PIECE_S = 0.02, 0.1, 0.5
 """A way that is no step of a plan is bounded in pieces of this length, each in this time."""
+TRIES = 3
+"""Ticks in a row without a trajectory, after which it is a fault; the arm brakes meanwhile."""
 DROPPED = 1e-5
 """m and rad: less of a chunk that is not executed is rounding."""
 
@@ -91,6 +93,7 @@ class MotionPipeline:
         commanded = None if self._joints is None or reach is None else reach.kinematics
         self._settling = Settling(commanded)
         self._rest_since_ns: int | None = None
+        self._tries = 0
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -247,7 +250,8 @@ class MotionPipeline:
             ticks: see `Commander.step`.
 
         Returns:
-            whether a trajectory was found (if not, the arm brakes), and events.
+            whether a trajectory was found (if not, the arm brakes) in one of the last `TRIES`
+            ticks, and events.
         """
         if self.timeline is None:
             return True, []
@@ -269,7 +273,13 @@ class MotionPipeline:
         for _ in range(ticks if went_on else 1):
             mover.step(self.mode)
         events += limit_events(mover.taken_hits())
-        return self.failures == failures, events
+        if self.failures == failures:
+            self._tries = 0
+            return True, events
+        self._tries += 1
+        self.goal = None  # the next tick tries again, from the brake
+        events.append(make_event("warning", "notice", "no_trajectory", mover.failure))
+        return state is State.ACTIVE and self._tries < TRIES, events
 
     def command(self, state: State) -> PoseCommand | JointCommand | None:
         """The set-point of the robot, while streaming."""

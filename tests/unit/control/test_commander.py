@@ -1300,10 +1300,8 @@ def test_a_robot_that_leaves_its_ready_mode_between_two_ticks_is_inactive_in_the
     assert out.task_changed
 
 
-@pytest.mark.parametrize("command", ["pose", "joint"])
-def test_a_goal_without_a_trajectory_is_a_fault_and_the_arm_brakes(
-    command: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def rising_rig(command: str) -> Rig:
+    """An arm on its way up."""
     of = profile(robot={"command": command})
     reach = reach_of(of)
     rig = Rig(of, reach=reach)
@@ -1313,12 +1311,38 @@ def test_a_goal_without_a_trajectory_is_a_fault_and_the_arm_brakes(
     rig.tick(chunks=[rig.chunk([UP] * 8)])
     rig.run(0.2)
     assert rig.state == "active"
+    return rig
+
+
+@pytest.mark.parametrize("command", ["pose", "joint"])
+def test_a_goal_without_a_trajectory_is_a_fault_and_the_arm_brakes(
+    command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rising_rig(command)
     monkeypatch.setattr(AxisSmoother, "_towards", lambda *_: (None, False))
     rig.tick(chunks=[rig.chunk([UP] * 8)])
     rig.run(1.0)
     assert rig.state == "fault"
     assert rig.commander.why == "no trajectory could be computed; braked"
     assert rig.commander.at_rest
+
+
+@pytest.mark.parametrize("command", ["pose", "joint"])
+def test_a_tick_without_a_trajectory_brakes_and_the_next_one_goes_on(
+    command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rising_rig(command)
+    with monkeypatch.context() as patch:
+        patch.setattr(AxisSmoother, "_towards", lambda *_: (None, False))
+        out = rig.tick(chunks=[rig.chunk([UP] * 8)])
+        out.events += rig.tick().events
+    told = [event.why for event in out.events if event.what == "no_trajectory"]
+    assert told
+    assert all("velocity [" in why and "target [" in why for why in told)
+    before_m = rig.commander.parts[0].motion.commanded.position_m[2]
+    rig.run(0.3)
+    assert rig.state == "active"
+    assert rig.commander.parts[0].motion.commanded.position_m[2] > before_m + 0.01
 
 
 # -- a prompt and an activation, put at once ------------------------------------------------------
