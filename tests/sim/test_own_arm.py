@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from described_arms import TAKEN, urdf
@@ -14,7 +15,9 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.program.main import app
+from vla_zenoh.simulation.scene import POSES, PREFIX, TCP_SITE
 from vla_zenoh.simulation.world import World, build_world
+from vla_zenoh.types import FloatArray
 
 STEPS = 2
 WAY_M = STEPS * 0.01
@@ -109,3 +112,26 @@ def test_a_joint_that_follows_one_of_the_arm_is_refused_by_name(tmp_path: Path, 
     said = " ".join(output.split())
     assert "the simulator" in said
     assert FOLLOWS in said
+
+
+def in_picture(model: mujoco.MjModel, data: mujoco.MjData, name: str, at_m: FloatArray) -> bool:
+    """Whether a point is in a square picture of a camera."""
+    camera = data.camera(name)
+    right, up, back = camera.xmat.reshape(3, 3).T @ (at_m - camera.xpos)
+    edge = -back * np.tan(np.radians(model.camera(name).fovy[0]) / 2)
+    return bool(max(abs(right), abs(up)) < edge)
+
+
+@pytest.mark.parametrize("size", [0.3, 1.0, 1.8])
+def test_the_cameras_see_arm_and_bricks_whatever_the_arms_size(tmp_path: Path, size: float) -> None:
+    rows = [row._replace(at_m=(0.0, 0.0, size * row.at_m[2])) for row in TAKEN["six joints"].rows]
+    code, output, file = new(tmp_path, urdf(rows))
+    assert code == 0, output
+    world = build_world(load_profile(str(file)))
+    model, data = world.model, mujoco.MjData(world.model)
+    mujoco.mj_setState(model, data, world.qpos(), POSES)
+    mujoco.mj_forward(model, data)
+    links = [model.body(n) for n in range(model.nbody) if model.body(n).name.startswith(PREFIX)]
+    for body in [*links, *map(model.body, ("red_brick", "blue_brick", "yellow_brick", "box"))]:
+        assert in_picture(model, data, "front", data.xpos[body.id]), body.name
+    assert in_picture(model, data, "wrist", data.site(PREFIX + TCP_SITE).xpos)

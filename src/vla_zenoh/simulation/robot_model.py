@@ -17,8 +17,6 @@ Rgba = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
 
 MIN_TOOL_M = 0.01
-CAMERA_OUT_M, CAMERA_BACK_M, CAMERA_AHEAD_M = 0.08, 0.08, 0.03
-"""Of a camera at a tool: beside it, behind its TCP, and how far ahead of that it looks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,13 +173,13 @@ def _any_arm(robot: RobotProfile) -> RobotModel:
             for link in described.links
             if any(joint.name in fingers for joint in described.chain(described.root, link))
         ),
-        camera=_behind_tcp(robot.tcp_frame, kinematics.tool_m),
+        camera=_at_tool(robot.tcp_frame, kinematics.tool_m),
         colours=(),
     )
 
 
-def _behind_tcp(link: str, tool_m: FloatArray) -> MountedCamera:
-    """A camera beside the tool that looks at the TCP.
+def _at_tool(link: str, tool_m: FloatArray) -> MountedCamera:
+    """A camera at the TCP that looks along the tool, until its scene puts it beside the hand.
 
     Args:
         link: of the TCP.
@@ -193,10 +191,7 @@ def _behind_tcp(link: str, tool_m: FloatArray) -> MountedCamera:
     across = np.eye(3)[int(np.argmin(np.abs(ahead)))]
     up = across - ahead * float(across @ ahead)
     up /= np.linalg.norm(up)
-    position_m, look_at_m = CAMERA_OUT_M * up - CAMERA_BACK_M * ahead, CAMERA_AHEAD_M * ahead
-    return MountedCamera(
-        "wrist", link, _vector(position_m), _vector(look_at_m), _vector(up), fovy_rad=1.2
-    )
+    return MountedCamera("wrist", link, (0.0, 0.0, 0.0), _vector(ahead), _vector(up), fovy_rad=1.2)
 
 
 def _vector(values: FloatArray) -> Vector3:

@@ -11,15 +11,17 @@ object may stand::
       <numeric name="place_gap_m" data="0.05"/>
     </custom>
 
-``distract/NAME`` is the same for a distractor, which is placed only on request. Appearance (lights,
-colour of the table, pose of the front camera) changes images alone, so only a renderer uses it.
+``distract/NAME`` is the same for a distractor, which is placed only on request. With an entry
+``fit/front`` the camera ``front`` goes back or forth until it just sees an arm that is made of its
+description, at home, and these places. Appearance (lights, colour of the table, pose of the front
+camera) changes images alone, so only a renderer uses it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +34,7 @@ from vla_zenoh.errors import ResourceError
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import arm_kinematics
 from vla_zenoh.simulation.any_arm import arm_spec
+from vla_zenoh.simulation.framing import axes_of, beside_hand, step_back
 from vla_zenoh.simulation.robot_model import MountedCamera, RobotModel
 from vla_zenoh.types import FloatArray
 
@@ -58,6 +61,7 @@ PAD_SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)  # the fingers are light, hence soft
 REGION_PREFIX = "place/"
 DISTRACTOR_PREFIX = "distract/"
 GAP = "place_gap_m"
+FITS = "fit/front"
 MAX_DRAWS = 1000
 
 LIGHTS, TABLE, CAMERA, DISTRACTORS = "lights", "table", "camera", "distractors"
@@ -88,6 +92,11 @@ def prefix_of(robot: RobotModel) -> str:
     return f"{robot.part}/" if robot.part else PREFIX
 
 
+def _camera_name(robot: RobotModel) -> str:
+    name = robot.camera.name if robot.camera is not None else ""
+    return f"{robot.part}_{name}" if robot.part else name
+
+
 def build_model(
     scene: str, robots: Sequence[RobotModel], *, joint_friction_nm: float = 0.0
 ) -> mujoco.MjModel:
@@ -111,16 +120,14 @@ def build_model(
             )
             frame.attach_body(arm.bodies[1], prefix_of(robot), "")
             if robot.camera is not None:
-                camera = f"{robot.part}_{robot.camera.name}" if robot.part else robot.camera.name
-                spec.camera(prefix_of(robot) + robot.camera.name).name = camera
+                spec.camera(prefix_of(robot) + robot.camera.name).name = _camera_name(robot)
         _set_solver(spec, jaw=any(len(robot.finger_joints) == 1 for robot in robots))
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         described = " and ".join(dict.fromkeys(robot.description for robot in robots))
         raise ResourceError(f"MuJoCo rejects scene {path} with {described}: {error}") from error
-    for robot in robots:
-        if robot.robot is not None:
-            _let_through(model, robot, robot.robot.home_rad)
+    if any(robot.robot is not None for robot in robots):
+        _fit(model, robots)
     # Two groups for ray casting.
     moving = model.body_weldid[model.geom_bodyid] != 0
     visible = model.geom_group < HIDDEN_GROUP
@@ -129,18 +136,51 @@ def build_model(
     return model
 
 
-def _let_through(model: mujoco.MjModel, robot: RobotModel, home_rad: Sequence[float]) -> None:
-    """Let shapes of the arm that are inside the table at home, as a shoulder's, touch nothing."""
-    data, prefix = mujoco.MjData(model), prefix_of(robot)
-    for name, position in zip(robot.arm_joints, home_rad, strict=True):
-        data.joint(prefix + name).qpos[0] = position
+def _fit(model: mujoco.MjModel, robots: Sequence[RobotModel]) -> None:
+    """Fit a scene to arms that are made of their descriptions: contacts and cameras."""
+    data = mujoco.MjData(model)
+    own_arms = [robot for robot in robots if robot.robot is not None]
+    for robot in own_arms:
+        home_rad = robot.robot.home_rad if robot.robot is not None else ()
+        for name, position in zip(robot.arm_joints, home_rad, strict=True):
+            data.joint(prefix_of(robot) + name).qpos[0] = position
     mujoco.mj_forward(model, data)
+    for robot in own_arms:
+        if robot.camera is not None:
+            own = _moving(model, robot)
+            _let_through(model, data, own)
+            camera = model.camera(_camera_name(robot)).id
+            beside_hand(
+                *(model, data, camera, own),
+                np.array(robot.camera.look_at_m),
+                np.array(robot.camera.up),
+            )
+    fits = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, FITS) >= 0
+    if fits and len(own_arms) == len(robots):
+        places = [
+            (x_m, y_m, 0.0)
+            for low, high in regions_of(model).values()
+            for x_m, y_m in product((low.x_m, high.x_m), (low.y_m, high.y_m))
+        ]
+        arms = [_corners_m(model, data, _moving(model, robot)) for robot in robots]
+        bases = [robot.base_m for robot in robots]
+        camera = model.camera(FRONT_CAMERA).id
+        step_back(model, data, camera, np.concatenate([*arms, places, bases]))
+
+
+def _let_through(model: mujoco.MjModel, data: mujoco.MjData, own: NDArray[np.bool_]) -> None:
+    """Let shapes of the arm that are inside the table at home, as a shoulder's, touch nothing."""
     moves = model.body_weldid[model.geom_bodyid] != 0
-    bodies = [model.body(int(body)).name for body in model.geom_bodyid]
-    own = np.array([name.startswith(prefix) for name in bodies]) & moves
     for pair in data.contact.geom[data.contact.dist < 0]:
         if not moves[pair].all():
             model.geom_contype[pair[own[pair]]] = 0
+
+
+def _moving(model: mujoco.MjModel, robot: RobotModel) -> NDArray[np.bool_]:
+    """Which geoms are of the robot, but for those that stand still."""
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    bodies = [model.body(int(body)).name for body in model.geom_bodyid]
+    return np.array([name.startswith(prefix_of(robot)) for name in bodies]) & moves
 
 
 def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
@@ -219,13 +259,9 @@ def _named(element: Any, kind: str, name: str, known: list[str]) -> Any:
 
 def _add_camera(link: mujoco.MjsBody, camera: MountedCamera) -> None:
     eye = np.array(camera.position_m)
-    back = eye - np.array(camera.look_at_m)  # a MuJoCo camera looks along its own -z
-    back /= np.linalg.norm(back)
-    right = np.cross(np.array(camera.up), back)
-    right /= np.linalg.norm(right)
-    rotation = np.column_stack([right, np.cross(back, right), back])
     quat_wxyz = np.empty(4)
-    mujoco.mju_mat2Quat(quat_wxyz, rotation.ravel())
+    axes = axes_of(eye, np.array(camera.look_at_m), np.array(camera.up))
+    mujoco.mju_mat2Quat(quat_wxyz, axes.ravel())
     link.add_camera(name=camera.name, pos=eye, quat=quat_wxyz, fovy=math.degrees(camera.fovy_rad))
 
 
@@ -324,6 +360,15 @@ def footprint_m(model: mujoco.MjModel, body: int) -> float:
         corners = box_corners(model, int(geom)) @ rotation.reshape(3, 3).T + model.geom_pos[geom]
         radius = max(radius, float(np.hypot(corners[:, 0], corners[:, 1]).max()))
     return radius
+
+
+def _corners_m(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool_]) -> FloatArray:
+    """(m, 3) corners of the bounding boxes of geoms, in the world."""
+    found = [np.zeros((0, 3))]
+    for geom in np.flatnonzero(geoms):
+        turn = data.geom_xmat[geom].reshape(3, 3)
+        found.append(box_corners(model, int(geom)) @ turn.T + data.geom_xpos[geom])
+    return np.concatenate(found)
 
 
 def box_corners(model: mujoco.MjModel, geom: int) -> FloatArray:
