@@ -375,7 +375,7 @@ COUNTERS = {
     "command.gripper_timeouts": "gripper commands that the gripper did not execute in time",
     "command.latch_failed": "times the latch file could not be written",
     "command.missed_ticks": "ticks of the command node that were skipped",
-    "command.smoothing_failures": "times Ruckig found no plan",
+    "command.smoothing_failures": "ticks without a plan of Ruckig, each an event `no_trajectory`",
     "dropped": "recorder: samples that were not written",
     "short_streams": "times too few of the samples that were sent arrived, see `net.short`",
     "lost": "rolling record: messages that were sent and never reached it",

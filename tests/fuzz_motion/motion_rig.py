@@ -151,7 +151,11 @@ class Rig:
         self.commander = Commander(profile, reach=reach)
         known = case.arm
         self.guard = ArmGuard(
-            profile, self._measure, (known.lower_rad, known.upper_rad), 1.0 / case.guard_hz
+            profile,
+            self._measure,
+            (known.lower_rad, known.upper_rad),
+            known.velocity_rad_s,
+            1.0 / case.guard_hz,
         )
         self._actions = Actions(case)
         self._period_ns = round(1e9 / profile.timing.command_hz)

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.limits import ROTATION_BOX, joint_motion_limits
+from vla_zenoh.control.limits import ROTATION_BOX, JointMotionLimits, joint_motion_limits
 from vla_zenoh.control.states import OBEYING
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
@@ -69,6 +69,7 @@ class ArmGuard:
         profile: of the robot.
         measure: reads the state of the arm.
         joint_range_rad: lower and upper ends of the joint ranges, (n,) each.
+        joint_velocity_rad_s: (n,) that the robot allows, whatever the profile says.
         dt_s: period of the controller.
     """
 
@@ -77,10 +78,13 @@ class ArmGuard:
         profile: Profile,
         measure: Callable[[], Measured],
         joint_range_rad: tuple[FloatArray, FloatArray],
+        joint_velocity_rad_s: FloatArray,
         dt_s: float,
     ) -> None:
         robot, timeout_s, here = profile.robot, profile.timing.command_timeout_s, measure()
-        brake = joint_motion_limits(profile, BRAKE_MARGIN)
+        velocity, acceleration, jerk = joint_motion_limits(profile, BRAKE_MARGIN)
+        velocity = np.minimum(velocity, BRAKE_MARGIN * joint_velocity_rad_s)
+        brake = JointMotionLimits(velocity, acceleration, jerk)
         self._guards: dict[CommandKind, PoseGuard | JointGuard] = {
             "pose": PoseGuard(here.pose, dt_s, timeout_s, pose_brake_limits(profile)),
             "joint": JointGuard(

@@ -49,7 +49,7 @@ class JointLimits(Section):
     A joint that slides has m/s, m/s^2 and m/s^3.
 
     Args:
-        velocity_rad_s: of the commanded motion.
+        velocity_rad_s: of the commanded motion; less where the description allows less.
         acceleration_rad_s2: of the commanded motion.
         jerk_rad_s3: of the commanded motion, and of the robot's own stop.
     """

@@ -167,8 +167,16 @@ class RobotDriver(ABC):
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper limit of the joints, (n,) each in the order of the profile."""
         arm = self.kinematics
-        order = [arm.arm_joints.index(name) for name in self.profile.robot.arm_joints]
-        return arm.lower_rad[order], arm.upper_rad[order]
+        return arm.lower_rad[self._order], arm.upper_rad[self._order]
+
+    @property
+    def joint_velocity_rad_s(self) -> FloatArray:
+        """Limits (n,) of the joints' velocity by the description, in the same order."""
+        return self.kinematics.velocity_rad_s[self._order]
+
+    @property
+    def _order(self) -> list[int]:
+        return [self.kinematics.arm_joints.index(name) for name in self.profile.robot.arm_joints]
 
     def forward(self, position_rad: FloatArray) -> Pose:
         """TCP pose with the joints at `position_rad` (n,), in the order of the profile."""

@@ -353,3 +353,8 @@ class SimPart(RobotDriver):
     @property
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
         return self._arm.joint_range_rad
+
+    @property
+    def joint_velocity_rad_s(self) -> FloatArray:
+        """Any: MuJoCo's model has none, and what commands the arm knows the description."""
+        return np.full(len(self.profile.robot.arm_joints), np.inf)

@@ -25,10 +25,10 @@ UNIT = np.array([0.0, 0.0, 0.0, 1.0])
 class Side:
     """An arm that stands where it is told, its guard, and a clock."""
 
-    def __init__(self, mode: CommandKind = "pose") -> None:
+    def __init__(self, mode: CommandKind = "pose", most_rad_s: float = np.inf) -> None:
         self.measured = Measured(Pose(np.array([0.43, 0.0, 0.3]), np.eye(3)), HOME_RAD, np.zeros(7))
         ends = HOME_RAD - 1, HOME_RAD + 1
-        self.guard = ArmGuard(PROFILE, lambda: self.measured, ends, 1e-3)
+        self.guard = ArmGuard(PROFILE, lambda: self.measured, ends, np.full(7, most_rad_s), 1e-3)
         self.guard.kind = mode
         self.now_ns, self.seq = START_NS, 0
 
@@ -70,6 +70,21 @@ def test_while_poses_are_followed_joints_are_refused_and_change_nothing() -> Non
     assert side.joint() == "other_mode"
     assert side.guard.kind == "pose"
     np.testing.assert_array_equal(side.guard.reference[0], before[0])
+
+
+def test_joints_are_no_faster_than_the_robot_s_description_allows() -> None:
+    speeds_rad_s = np.arange(0.0, 0.3, 0.005)
+    ways_rad = np.cumsum(speeds_rad_s) * 4e-3
+    answers: dict[float, list[str | None]] = {}
+    for most_rad_s in (np.inf, 0.1):
+        side = Side("joint", most_rad_s)
+        answers[most_rad_s] = []
+        for way_rad, speed_rad_s in zip(ways_rad, speeds_rad_s, strict=True):
+            answers[most_rad_s].append(side.joint(way_rad, speed_rad_s))
+            side.tick(4)
+    assert not any(answers[np.inf])
+    assert not any(answers[0.1][:40])
+    assert set(answers[0.1][41:]) == {"too_fast"}
 
 
 def test_while_joints_are_followed_poses_are_refused() -> None:

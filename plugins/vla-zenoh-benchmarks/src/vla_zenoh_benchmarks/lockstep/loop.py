@@ -90,6 +90,7 @@ class Lockstep:
                 profile.of_part(name),
                 partial(self._measure, name),
                 self._arm(name).joint_range_rad,
+                np.full(len(profile.of_part(name).robot.arm_joints), np.inf),
                 TICK_NS / 1e9,
             )
             for name in profile.part_names
