@@ -1339,10 +1339,13 @@ def test_a_tick_without_a_trajectory_brakes_and_the_next_one_goes_on(
     told = [event.why for event in out.events if event.what == "no_trajectory"]
     assert told
     assert all("velocity [" in why and "target [" in why for why in told)
-    before_m = rig.commander.parts[0].motion.commanded.position_m[2]
+    before = rig.commander.parts[0].motion.commanded
     rig.run(0.3)
+    after = rig.commander.parts[0].motion.commanded
     assert rig.state == "active"
-    assert rig.commander.parts[0].motion.commanded.position_m[2] > before_m + 0.01
+    assert before is not None
+    assert after is not None
+    assert after.position_m[2] > before.position_m[2] + 0.01
 
 
 # -- a prompt and an activation, put at once ------------------------------------------------------
