@@ -68,6 +68,13 @@ OF_INSPECT = (
     *("-c", str(ROOT / "constraints.txt"), "-e", f"{ROOT}[control]"),
     *(word for name in OURS for word in ("-e", str(ROOT / "plugins" / name))),
 )
+RAY = "RAY_PYTHON"
+"""Environment variable with the Python that has Ray Serve, and us in front of it."""
+OF_RAY = (
+    "ray[serve]==2.60.0",
+    *("-c", str(ROOT / "constraints.txt"), "-e", f"{ROOT}"),
+    *("-e", str(ROOT / "plugins" / "vla-zenoh-ray")),
+)
 ENVIRONMENTS: tuple[tuple[str, str, tuple[str, ...], tuple[str, ...], str], ...] = (
     (PHYSICALAI, "physicalai", ALONE, NEEDED, sys.executable),
     (FRANKA_NODE, "franka-node", (), OF_FRANKA_NODE, sys.executable),
@@ -75,6 +82,7 @@ ENVIRONMENTS: tuple[tuple[str, str, tuple[str, ...], tuple[str, ...], str], ...]
     (TROSSEN, "trossen", (), OF_TROSSEN, sys.executable),
     (STRANDS, "strands", (), OF_STRANDS, "3.12"),
     (INSPECT, "inspect", (), OF_INSPECT, sys.executable),
+    (RAY, "ray", (), OF_RAY, sys.executable),
 )
 """Variable, folder, packages without what they need, packages with it, Python or its version."""
 NAMES = tuple(name for _, name, *_ in ENVIRONMENTS)

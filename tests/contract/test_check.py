@@ -180,9 +180,9 @@ OF_ONE_SCENE = {"scripted_pair", "scripted_pick"}
 OF_BENCHMARKS = {"libero_privileged", "metaworld_expert", "ogbench_expert", "so101_expert"}
 """They act on what a benchmark knows, which no observation of a check has."""
 
-OF_A_CLIENT = {"physicalai_client", "r2c_policy"}
-"""They have no answer without a peer: tests/unit/policy/test_physicalai_client.py, test_r2c_bus.py.
-"""
+OF_A_CLIENT = {"physicalai_client", "r2c_policy", "ray_serve"}
+"""They have no answer without a peer: tests/unit/policy/test_physicalai_client.py, test_r2c_bus.py,
+test_ray_spread.py."""
 
 
 def test_every_shipped_worker_is_checked() -> None:

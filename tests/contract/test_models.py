@@ -34,6 +34,7 @@ ELSEWHERE = {
     "origami",
     "physicalai_client",
     "r2c_policy",
+    "ray_serve",
     "xpolicylab",
 }
 """They need weights, a server or a client: tested with those, by themselves."""

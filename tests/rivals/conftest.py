@@ -8,6 +8,7 @@ import franka_node_rig
 import physicalai_rig
 import pytest
 import r2c_rig
+import ray_rig
 import strands_rig
 import trossen_rig
 
@@ -17,6 +18,7 @@ NEEDS = {
     "test_r2c": r2c_rig.VARIABLE,
     "test_strands": strands_rig.VARIABLE,
     "test_inspect": "INSPECT_PYTHON",
+    "test_ray_serve": ray_rig.VARIABLE,
     "test_trossen": trossen_rig.VARIABLE,
 }
 """Beginning of a file's name -> environment variable."""
