@@ -134,7 +134,7 @@ class FilePlugin:
 
     Args:
         file: the file, or a folder with a ``model.py``. A PEP 723 header asks for an environment of
-            its own, in which the package that brings the file is not installed.
+            its own, which has the package that brings the file only if the header names it.
     """
 
     file: Path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -42,7 +43,9 @@ EXPERTS = {"libero_privileged", "metaworld_expert", "ogbench_expert", "so101_exp
 """They need their benchmark and its state."""
 HERE = [name for name in MODELS if name not in ELSEWHERE | EXPERTS]
 HEAVY = ("torch", "tensorflow", "jax", "zenoh", "mujoco")
-SHARED = "vla-zenoh-policy-servers"
+OUR_PACKAGE = re.compile(r"(?m)^\s*from (vla_zenoh_(?!model_)\w+)")
+"""A package of ours besides the core: an environment of the model's own has what its header names.
+"""
 PROMPTS = {"scripted": "HARD: go up"}
 PROFILES = {"scripted_pair": "two_pandas_sim", "scripted_pick": "so101_sim"}
 """Of workers that act for one robot."""
@@ -97,12 +100,13 @@ def test_its_header_says_what_it_needs(name: str) -> None:
     assert model.dependencies, "a PEP 723 header with its dependencies is missing"
     assert model.requires_python
     ours = {need for need in model.dependencies if need.startswith("vla-zenoh")}
-    assert ours == ({SHARED} if SHARED.replace("-", "_") in sources(model.path) else set())
+    imported = set(OUR_PACKAGE.findall(sources(model.path)))
+    assert ours == {name.replace("_", "-") for name in imported}
 
 
 def sources(path: Path) -> str:
     """Text of the file of a model and of those beside it."""
-    files = path.parent.rglob("*.py") if path.name == "model.py" else [path]
+    files = path.parent.glob("*.py") if path.name == "model.py" else [path]
     return "".join(file.read_text("utf-8") for file in files)
 
 

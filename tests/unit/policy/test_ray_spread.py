@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 from vla_zenoh_ray import spread
-from vla_zenoh_ray.ray_model import RayServe
+from vla_zenoh_ray.model import RayServe
 from vla_zenoh_ray.replica import Replica
 from vla_zenoh_ray.spread import Spread
 
 from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.policy import ActionSteps, Observation
+from vla_zenoh.policy.loader import find_model
 from vla_zenoh.types import Task
 
 MODEL = '''
@@ -171,6 +172,12 @@ def test_a_replica_with_another_spec_is_refused_by_name(model: Path) -> None:
     model.write_text(MODEL.replace("horizon=1", "horizon=2"))
     with pytest.raises(SpecError, match=f"the worker has {front.spec.hash}: give both hosts"):
         Replica(str(model), {}, "", front.spec.hash)
+
+
+def test_its_environment_has_ray_and_what_the_model_asks_for(model: Path) -> None:
+    model.write_text('# /// script\n# dependencies = ["torch==2.9.0"]\n# ///\n' + MODEL)
+    brought = find_model("ray_serve").for_options({"model": str(model), "factor": "2"})
+    assert brought.dependencies == ("ray[serve]>=2.60", "vla-zenoh-ray", "torch==2.9.0")
 
 
 def test_a_model_that_remembers_one_robot_is_refused(model: Path) -> None:

@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "msgspec", "eclipse-zenoh"]
+# dependencies = ["numpy", "msgspec", "eclipse-zenoh", "vla-zenoh-physicalai"]
 # ///
 """A client of Intel's physicalai as a worker: it sees our arm as a robot of its own.
 

@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "eclipse-zenoh", "protobuf>=5"]
+# dependencies = ["numpy", "eclipse-zenoh", "protobuf>=5", "vla-zenoh-r2c"]
 # ///
 """A policy that answers over Huawei's R2C as a worker: our arm is a robot of its own.
 

@@ -6,4 +6,4 @@ from pathlib import Path
 
 from vla_zenoh.plugins import FilePlugin
 
-RAY_SERVE = FilePlugin(file=Path(__file__).with_name("ray_model.py"))
+RAY_SERVE = FilePlugin(file=Path(__file__).parent)

@@ -1,3 +1,7 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["ray[serve]>=2.60", "vla-zenoh-ray"]
+# ///
 """A model whose replicas Ray Serve keeps, on several GPUs or hosts: ``vla-zenoh worker ray_serve``.
 
 The worker in front keeps what robots rely on: spec hash, newest observation, prefix, provenance.
@@ -6,7 +10,6 @@ The worker in front keeps what robots rely on: spec hash, newest observation, pr
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -28,6 +31,8 @@ QUEUED = 2
 HEALTH_PERIOD_S, HEALTH_PATIENCE_S = 2.0, 10.0
 SHUT_DOWN_S = 2.0
 METHOD = "answers"
+APP_DIGITS = 8
+"""Of a spec's hash, in the name of an application."""
 
 
 class RayServe:
@@ -38,7 +43,7 @@ class RayServe:
         replicas: how many, on as many GPUs or hosts.
         address: of the Ray cluster, as ``HOST:PORT`` or ``auto``; empty: one of its own here.
         gpus, cpus: that one replica takes of its host, as Ray counts them.
-        app: name of the application in Ray Serve; empty: one of this worker's process.
+        app: name of the application in Ray Serve; empty: that of the model and its spec.
         profile: of the robots.
         options: of the model.
     """
@@ -57,11 +62,13 @@ class RayServe:
         self._model, self._options, self._profile = model, options, profile
         self._replicas = whole_number("replicas", replicas, least=1)
         self._resources = {"num_gpus": number("gpus", gpus), "num_cpus": number("cpus", cpus)}
-        self._address, self._app = address, app or f"vla-zenoh-{os.getpid()}"
+        self._address = address
         # Only its spec: weights are the replicas'.
         front = make_policy(find_model(model), options, profile=profile or None)
         refuse_shared_memory(front)
         self.spec = front.spec
+        # A worker that is started again in a cluster that lived on replaces its old replicas.
+        self._app = app or f"{self.spec.name}-{self.spec.hash[:APP_DIGITS]}"
         self.takes_committed = bool(getattr(front, "takes_committed", False))
         self.example_prompts = getattr(front, "example_prompts", ())
         if getattr(front, "infer_batch", None) is None:
