@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,7 @@ from vla_zenoh_dataset.videos import chosen
 from vla_zenoh_policy_servers.state_vector import read_parts
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.recording.run import Run, load_run
+from vla_zenoh.lab.recording.run import Run, load_run, pictures
 from vla_zenoh.policy import ActionSpec, standing_step
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.load import to_yaml
@@ -183,6 +184,33 @@ def test_a_picture_that_was_overtaken_is_shown_for_no_frame(run_file: Path) -> N
     assert set(shown) == {0, 1, 4, 6, 7}
     for number, frame in zip(shown, episode.frames, strict=True):
         assert stamps_ns[number] <= frame.stamp_ns
+
+
+@pytest.mark.parametrize("late_s", [0.05, 0.4, 0.9])
+def test_an_episode_begins_with_the_first_image_and_shows_none_of_the_future(
+    late_s: float, run_file: Path, tmp_path: Path
+) -> None:
+    episodes = episodes_of(load_run(run_file))
+    whole = [len(episode.frames) for episode in episodes]
+    first = next(iter(pictures(episodes[0].run.file, "front")))
+    early = episodes[0]
+    early.frames = [
+        replace(frame, stamp_ns=first.stamp_ns - round((late_s - at / FPS) * 1e9))
+        for at, frame in enumerate(early.frames)
+    ]
+    written = export(tmp_path / "out", episodes, ["front"], PARTS)
+    missed = sum(frame.stamp_ns < first.stamp_ns for frame in early.frames)
+    assert 0 < missed == math.ceil(late_s * FPS)
+    assert written.frames == sum(whole) - missed
+
+
+def test_an_episode_without_any_image_of_a_camera_is_named(run_file: Path, tmp_path: Path) -> None:
+    episodes = episodes_of(load_run(run_file))
+    first = next(iter(pictures(episodes[0].run.file, "front")))
+    before_ns = first.stamp_ns - 1_000_000
+    episodes[1].frames = [replace(frame, stamp_ns=before_ns) for frame in episodes[1].frames]
+    with pytest.raises(RecordingError, match=r"ended before the first image.*--camera"):
+        export(tmp_path / "out", episodes, ["front"], PARTS)
 
 
 def test_info_names_and_types_what_the_spec_declares(dataset: Path) -> None:

@@ -43,7 +43,14 @@ from vla_zenoh_dataset.features import (
     to_scale_with,
     worker_options,
 )
-from vla_zenoh_dataset.videos import DepthColumn, EpisodeVideo, chosen, stamps_of, write_videos
+from vla_zenoh_dataset.videos import (
+    DepthColumn,
+    EpisodeVideo,
+    chosen,
+    from_first_image,
+    stamps_of,
+    write_videos,
+)
 
 VERSION = "v3.0"
 FILES_IN_A_CHUNK = 1000
@@ -84,6 +91,9 @@ def export(
 ) -> Written:
     """Write a dataset.
 
+    An episode begins with the first frame for which every camera has an image: one that is shown
+    nothing newer than a policy could have seen.
+
     Args:
         folder: must not exist, or be empty.
         parts: of the state, see `vla_zenoh_policy_servers.state_vector`.
@@ -108,7 +118,8 @@ def export(
         check_never_turns(episodes)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RecordingError(f"{folder} is there already; give --output a new folder")
-    return _Dataset(folder, episodes, cameras, parts, depth, rotation=rotation).write(progress)
+    seen = from_first_image(episodes, cameras, depth)
+    return _Dataset(folder, seen, cameras, parts, depth, rotation=rotation).write(progress)
 
 
 def _step(episode: RecordedEpisode) -> dict[str, ActionSpec]:

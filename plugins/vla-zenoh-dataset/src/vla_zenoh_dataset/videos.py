@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +30,32 @@ def stamps_of(run: Run, camera: str) -> list[int]:
     return [picture.stamp_ns for picture in pictures(run.file, camera)]
 
 
+def from_first_image(
+    episodes: Sequence[RecordedEpisode], cameras: Sequence[str], depth: Sequence[str]
+) -> list[RecordedEpisode]:
+    """The same episodes, each from the first frame for which every camera has an image.
+
+    Raises:
+        RecordingError: no frame of an episode is left.
+    """
+    readers = [(pictures, camera) for camera in cameras] + [(depths, camera) for camera in depth]
+    begins_ns: dict[int, int] = {}
+    kept = []
+    for episode in episodes:
+        run = episode.run
+        if id(run) not in begins_ns:
+            firsts = [next(iter(read(run.file, camera)), None) for read, camera in readers]
+            begins_ns[id(run)] = max((each.stamp_ns for each in firsts if each), default=0)
+        frames = [frame for frame in episode.frames if frame.stamp_ns >= begins_ns[id(run)]]
+        if not frames:
+            raise RecordingError(
+                f"{run.path}: an episode ended before the first image of one of its cameras; leave "
+                "the camera out with --camera, or the recording"
+            )
+        kept.append(replace(episode, frames=frames))
+    return kept
+
+
 def chosen(
     episode: RecordedEpisode, camera: str, stamps: list[int], kind: str = "images"
 ) -> list[int]:
@@ -43,8 +70,8 @@ def chosen(
     in_time = [stamps[index] for index in order]
     out = []
     for frame in episode.frames:
-        at = max(bisect_right(in_time, frame.stamp_ns) - 1, 0)
-        if not in_time or abs(frame.stamp_ns - in_time[at]) > OLDEST_NS:
+        at = bisect_right(in_time, frame.stamp_ns) - 1
+        if at < 0 or frame.stamp_ns - in_time[at] > OLDEST_NS:
             if not in_time:
                 there = ", ".join(sorted(episode.run.picture_counts)) or "none"
                 raise RecordingError(
