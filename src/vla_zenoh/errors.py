@@ -57,6 +57,11 @@ class SpecError(VlaZenohError, ValueError):
         self.reason = reason
 
 
+class PromptError(SpecError):
+    """A model does not know the prompt. It counts against a worker that is chosen only: to any
+    other the prompt was not addressed."""
+
+
 class ResourceError(VlaZenohError, FileNotFoundError):
     """A model, scene, profile or robot description was not found."""
 

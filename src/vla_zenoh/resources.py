@@ -142,7 +142,10 @@ def robot_urdf(description: str) -> Path:
     if not description.startswith(ROBOT_DATA_PREFIX):
         path = Path(description).expanduser()
         if not path.is_file():
-            raise ResourceError(f"robot description {description!r} is not a file")
+            raise ResourceError(
+                f"robot description {description!r} is not a file; a path in a profile is relative "
+                "to the profile's folder"
+            )
         return path.resolve()
     import importlib.metadata  # only here: it takes 45 ms
 

@@ -388,7 +388,7 @@ class Commander:
         for reason in reasons:
             level = "info" if passing else "warning"
             self._emit(level, "refusal", f"{what}_refused", reason)
-            self._out.rejections.append(Rejection(f"{what}_refused", reason))
+            self._out.rejections.append(Rejection(f"{what}_refused", reason, quiet=passing))
 
     def latch(self, why: str) -> None:
         """Start in STOPPED: an emergency stop outlives the process that received it."""

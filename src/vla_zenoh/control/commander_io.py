@@ -196,7 +196,7 @@ def limit_events(hits: Iterable[LimitHit]) -> list[Event]:
     """Events for the limits that acted on the steps of a chunk, see `ChunkPlanner`."""
     events: list[Event] = []
     for hit in hits:
-        level, why = "warning", f"shortened{hit.at}"
+        level, why = "warning", f"shortened{hit.at}{hit.way_out}"
         if hit.name == APPROACH:
             level = "info"
             why = f"target {hit.value:.3g} {hit.where} away, over a step: approached slowly"

@@ -126,6 +126,13 @@ def joint_margins(limits: ReachLimits, kinematics: Kinematics) -> FloatArray:
     return np.where(kinematics.slides, limits.joint_margin_m, limits.joint_margin_rad)
 
 
+WAYS_OUT = {
+    "singularity": ": the arm is stretched, or two of its axes are in line; lead it back the way "
+    "it came, or by its joints (`vla-zenoh do home`)",
+}
+"""What to do about a limit whose name does not say it, to end a sentence."""
+
+
 class LimitHit(NamedTuple):
     """A limit that acted.
 
@@ -148,6 +155,11 @@ class LimitHit(NamedTuple):
     def at(self) -> str:
         """ " at WHERE" for a sentence, empty for the whole arm."""
         return f" at {self.where}" if self.where else ""
+
+    @property
+    def way_out(self) -> str:
+        """What to do about it, to end a sentence; empty where the name says it."""
+        return WAYS_OUT.get(self.name, "")
 
 
 def bound_step(limits: Limits, before: Pose, asked: Pose) -> tuple[Pose, list[LimitHit]]:

@@ -91,7 +91,7 @@ def too_near(hit: LimitHit) -> Brake:
     """The brake at a bound of the measured arm."""
     why = (
         f"the measured arm is too near to a bound: {hit.name}{hit.at} is {hit.value:.3g}, "
-        f"the limit is {hit.limit:.3g}"
+        f"the limit is {hit.limit:.3g}{hit.way_out}"
     )
     event = make_event("warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit)
     return Brake(why, event, late=False)

@@ -79,11 +79,12 @@ def test_an_activation_while_only_something_starts_is_rejected_as_a_notice() -> 
     rig.tick(chunks=[rig.chunk([STAND])])
     there = rig.peers
     rig.peers = replace(there, camera_ages_s={}, camera_reasons={"front": OPENING})
-    rig.put("active", True)
+    starting = rig.tick(Setting("active", True))
     rig.peers = replace(there, alive=there.alive - {"camera"})
-    rig.put("active", True)
+    gone = rig.tick(Setting("active", True))
     levels = [(event.what, event.level) for event in rig.events if event.kind == "refusal"]
     assert levels == [("activate_refused", "info"), ("activate_refused", "warning")]
+    assert [each.quiet for out in (starting, gone) for each in out.rejections] == [True, False]
 
 
 def test_activation_begins_where_the_robot_holds_and_does_not_move_it() -> None:

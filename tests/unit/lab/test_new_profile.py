@@ -21,6 +21,7 @@ from vla_zenoh_newarm.posture import Posture
 from vla_zenoh_newarm.structure import structure
 
 from vla_zenoh.errors import ProfileError
+from vla_zenoh.kinematics.collision import CollisionModel
 from vla_zenoh.kinematics.description import Description
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.program.main import app
@@ -200,8 +201,9 @@ def test_a_description_without_any_shapes_gets_some(tmp_path: Path) -> None:
     assert found.path.read_text().count("<collision>") >= len(JOINTS_6) - 1
 
 
-def test_a_mesh_is_found_wherever_the_copy_is(tmp_path: Path) -> None:
-    package = tmp_path / "away"
+def meshed(folder: Path) -> str:
+    """A description that lacks ends of a joint, one of whose shapes is a mesh below `folder`."""
+    package = folder / "away"
     package.mkdir()
     corners = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
     facets = [
@@ -211,9 +213,28 @@ def test_a_mesh_is_found_wherever_the_copy_is(tmp_path: Path) -> None:
     ]
     (package / "link.stl").write_text(f"solid link\n{''.join(facets)}endsolid link\n")
     endless = Row("j6", kind="continuous", limit="")
-    text = urdf([*arm(SIX, j6=endless), TOOL]).replace(BALL, MESH, 1)
-    found, _ = mended(tmp_path, text)
-    assert str(package / "link.stl") in found.path.read_text()
+    return urdf([*arm(SIX, j6=endless), TOOL]).replace(BALL, MESH, 1)
+
+
+def test_a_mesh_is_found_wherever_the_copy_is(tmp_path: Path) -> None:
+    source, copy = tmp_path / "arm.urdf", tmp_path / "elsewhere" / "copy.urdf"
+    source.write_text(meshed(tmp_path))
+    made = Mended(source, {}, tmp_path)
+    made.give_ends(JOINTS_6)
+    copy.parent.mkdir()
+    made.save(copy)
+    assert str(tmp_path / "away" / "link.stl") in copy.read_text()
+
+
+def test_a_copy_moves_together_with_its_meshes(tmp_path: Path) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir()
+    found, _ = mended(here, meshed(here))
+    here.rename(there)
+    kinematics = Kinematics(there / found.path.name, "tcp", JOINTS_6)
+    assert "base" in [
+        shape.name for shape in CollisionModel(kinematics, near_m=0.0).links().geometryObjects
+    ]
 
 
 def test_a_xacro_is_expanded(tmp_path: Path) -> None:

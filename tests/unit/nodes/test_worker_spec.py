@@ -8,9 +8,11 @@ from camera_rig import routed_session
 
 from vla_zenoh.bus.buffers import Wake, bytes_of
 from vla_zenoh.codec import records
+from vla_zenoh.errors import PromptError
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.policy import ActionSpec, ActionSteps, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import load_profile
+from vla_zenoh.types import Task
 
 WAIT_S = 5.0
 
@@ -47,3 +49,19 @@ def test_a_worker_answers_a_query_of_its_spec(
         records.decode(ModelSpec, bytes_of(each.ok.payload)) for each in replies if each.ok
     )
     assert answer == model.spec
+
+
+@pytest.mark.parametrize(("chosen", "counted"), [("feel", {"refused.contract": 1}), ("other", {})])
+def test_only_a_worker_that_is_chosen_counts_a_prompt_that_it_does_not_know(
+    chosen: str, counted: dict[str, int]
+) -> None:
+    profile, model = load_profile("panda_sim"), Feel((), ())
+    with routed_session() as session:
+        worker = RobotSession(
+            profile, session, model, "feel", images="raw", host=None, changed=Wake()
+        )
+        worker.task = Task(1, False, "dance", chosen, 5.0)
+        worker.failed(PromptError("it knows no 'dance'"))
+        worker.close()
+    assert worker.complaint == "contract: it knows no 'dance'"
+    assert dict(worker.node.counters) == counted

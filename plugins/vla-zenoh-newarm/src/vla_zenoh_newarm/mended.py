@@ -96,7 +96,7 @@ class Mended:
         return copy
 
     def _write(self, path: Path) -> None:
-        _name_meshes(self._robot, self.source)
+        _name_meshes(self._robot, self.source, path.parent)
         path.write_text(ElementTree.tostring(self._robot, encoding="unicode"), "utf-8")
 
 
@@ -282,8 +282,17 @@ def _is_readable(file: Path) -> bool:
     return True
 
 
-def _name_meshes(robot: ElementTree.Element, source: Path) -> None:
-    """Give every mesh the whole path of its file: the copy may be anywhere."""
+def _name_meshes(robot: ElementTree.Element, source: Path, folder: Path) -> None:
+    """Name every mesh below `folder`, where the copy is, from there: both may be moved together.
+
+    Any other gets the whole path of its file.
+    """
     for mesh in robot.iter("mesh"):
-        if (found := _mesh(mesh.get("filename", ""), source)) is not None:
-            mesh.set("filename", str(found))
+        found = _mesh(mesh.get("filename", ""), source)
+        if found is None:
+            continue
+        inside = found.is_relative_to(folder.resolve())
+        mesh.set(
+            "filename",
+            f"package://{found.relative_to(folder.resolve())}" if inside else str(found),
+        )

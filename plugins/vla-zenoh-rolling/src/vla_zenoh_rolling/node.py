@@ -233,7 +233,10 @@ class RollingRecord:
         self._add("command", sample.received_ns, event=event.what, why=event.why)
         if why := STOPS.get(event.what.rpartition("->")[2]):
             self._want(why)
-        elif event.what == REFUSED and time.monotonic() - self._refused_s > APART_S:
+            return
+        # One that only waits for what is starting is tried again, and no incident.
+        incident = event.what == REFUSED and event.level != "info"
+        if incident and time.monotonic() - self._refused_s > APART_S:
             self._refused_s = time.monotonic()
             self._want("activation refused")
 

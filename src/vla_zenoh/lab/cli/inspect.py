@@ -20,6 +20,7 @@ from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.client.client import Client
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
+from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.cli.options import EndAfterOption
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
 from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
@@ -58,7 +59,8 @@ def inspect(
 ) -> None:
     """Show or save inferences: images as the model got them, prompt, raw output, final action.
 
-    Workers publish them only while this runs.
+    The numbers of a step have the order and units that the model's spec declares. Workers publish
+    inferences only while this runs.
     """
     live = console().is_terminal and not as_json
     if not live and seconds is None and count is None:
@@ -107,9 +109,13 @@ def _fail(target: RobotTarget, client: Client, worker: str | None) -> NoReturn:
         fail(target.no_node(client, *words, kind="command node"))
     if why := target.not_operator(client.profile, *words):
         fail(f"inferences are for operators: {why}")
+    nodes = client.snapshot()
+    asked = [name for name in nodes if name.startswith(worker_node(worker or ""))]
+    complaints = {name: str(nodes[name][0].detail.get("complaint", "")) for name in asked}
+    why = "; ".join(f"{name} says: {one_line(said)}" for name, said in complaints.items() if said)
     fail(
-        f"no inference of {worker or 'any worker'} of {target.named(client)}; does it run? "
-        f"(`{target.typed('status')}`)"
+        f"no inference of {worker or 'any worker'} of {target.named(client)}"
+        f"{': ' if why else '; does it run?'}{why} (`{target.typed('status')}`)"
     )
 
 

@@ -12,7 +12,7 @@ import re
 from functools import lru_cache
 from typing import NamedTuple
 
-from vla_zenoh.errors import SpecError
+from vla_zenoh.errors import PromptError
 
 STEP_M, STEP_RAD, STEP_WIDTH_M = 0.01, 0.05, 0.05
 MAX_COUNT = 100_000
@@ -98,7 +98,7 @@ def parse_scripted(prompt: str) -> ScriptedPrompt:
     """Read ``HARD: go up``, ``HARD: rol left x20`` (so spelt in the thesis too) or ``hold``.
 
     Raises:
-        SpecError: it names no motion; lists the known ones.
+        PromptError: it names no motion; lists the known ones.
     """
     match = _PROMPT.fullmatch(" ".join(prompt.split()))
     name = match["name"].lower().replace("rol ", "roll ") if match else ""
@@ -107,7 +107,7 @@ def parse_scripted(prompt: str) -> ScriptedPrompt:
     if match is not None and name == "hold":
         return ScriptedPrompt(None, count)
     if match is None or name not in HARD or (count or 0) > MAX_COUNT or within == 0.0:
-        raise SpecError(
+        raise PromptError(
             f"the scripted model does not know the prompt {prompt!r}; it knows: 'hold', "
             + ", ".join(f"'HARD: {known}'" for known in HARD)
             + "; a count and a range may follow, as in 'HARD: go down x50 within 0.1'"

@@ -23,7 +23,7 @@ from vla_zenoh.bus.stream import Stream
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_depth, decode_jpeg, decode_raw
 from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.errors import PeerError, SpecError, in_words
+from vla_zenoh.errors import PeerError, PromptError, SpecError, in_words
 from vla_zenoh.keys import LOADING, NO_TASK, STARTING, Kind, worker_node
 from vla_zenoh.nodes.worker import gpus
 from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps, reset_of
@@ -270,14 +270,19 @@ class RobotSession:
         self._specs.publish(self.spec)
 
     def failed(self, error: Exception, reason: str = "") -> None:
-        """Count and report an inference that failed; the next one is due a little later."""
+        """Count and report an inference that failed; the next one is due a little later.
+
+        A prompt that was meant for another worker is only what `complaint` says.
+        """
         if not reason and isinstance(error, PeerError):
             reason = error.reason
         elif not reason:
             reason = "contract" if isinstance(error, SpecError) else "inference_failed"
         why = in_words(error)
         self.complaint = f"{reason}: {why}"
-        self.node.reject(reason, why)
+        chosen = self.task is None or self.task.worker == self.name
+        if chosen or not isinstance(error, PromptError):
+            self.node.reject(reason, why)
         self.due_s = time.monotonic() + AFTER_A_FAILURE_S
 
     def report(self, *, now: bool = False) -> None:
