@@ -189,7 +189,7 @@ class Start:
 
     def memory(self) -> dict[str, dict[str, float]]:
         """Process -> its resident set, what of it is its own alone (MB), and its threads."""
-        found = {name: _memory(pid) for name, pid in self._pids.items()}
+        found = {name: memory(pid) for name, pid in self._pids.items()}
         rows = list(found.values())
         found["all"] = {key: sum(row[key] for row in rows) for key in rows[0]}
         segments = set(SEGMENTS[0].glob(SEGMENTS[1])) - self._segments
@@ -198,7 +198,8 @@ class Start:
         return found
 
 
-def _memory(pid: int) -> dict[str, float]:
+def memory(pid: int) -> dict[str, float]:
+    """Resident set of a process, what of it is its own alone (MB), and its threads."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
     kb = {name: int(value.split()[0]) for name, value in (line.split(":") for line in lines)}
     own_kb = kb["Private_Clean"] + kb["Private_Dirty"]

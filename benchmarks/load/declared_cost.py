@@ -21,6 +21,7 @@ from vla_zenoh.policy import (
 )
 
 HORIZON, DT_S = 10, 0.1
+CAMERAS = ("front", "wrist", "side")
 
 
 class DeclaredCost:
@@ -30,14 +31,28 @@ class DeclaredCost:
         cost_ms: c, of one robot.
         growth: k, the share of it that each further robot adds; 1: batching gains nothing.
         max_batch: robots in one inference; 0: all.
+        cameras: images of an observation.
+        side: their width and height; 0: any.
     """
 
-    def __init__(self, cost_ms: str = "80", growth: str = "0.15", max_batch: str = "0") -> None:
+    def __init__(
+        self,
+        cost_ms: str = "80",
+        growth: str = "0.15",
+        max_batch: str = "0",
+        cameras: str = "1",
+        side: str = "0",
+    ) -> None:
         self._cost_s, self._growth = float(cost_ms) / 1e3, float(growth)
         self.max_batch = int(max_batch)
+        size = int(side) or None
+        seen = tuple(
+            CameraSpec(camera=name, width=size, height=size, resize="pad" if size else "none")
+            for name in CAMERAS[: int(cameras)]
+        )
         self.spec = ModelSpec(
             name="declared",
-            observation=ObservationSpec(cameras=(CameraSpec(camera="front"),), state=()),
+            observation=ObservationSpec(cameras=seen, state=()),
             action=ActionSpec(horizon=HORIZON, dt_s=DT_S, gripper="none"),
         )
 

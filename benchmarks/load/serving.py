@@ -1,23 +1,28 @@
 """Age of a chunk as the robots of one model become more: our worker beside other servers.
 
-A chunk's age is the time from the camera's stamp to the chunk's arrival at its robot, the same for
+A chunk's age is the time from the cameras' stamp to the chunk's arrival at its robot, the same for
 all. The robots are one process that publishes images or asks with them; the model sleeps for its
 declared cost, c (1 + k (n - 1)) for n robots at once. The other servers answer one robot after
-another, so each inference costs c there.
+another, so each inference costs c there. LeRobot's serves one robot, so each has one, and they take
+turns on one GPU.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
+import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
@@ -26,9 +31,12 @@ from rich.table import Table
 from vla_zenoh_benchmarks.command_runner import cpu_s
 from vla_zenoh_benchmarks.result_file import ResultOptions, kept_rows
 
-from benchmarks import peers
-from benchmarks.chain.process import Server, free_port
-from benchmarks.load.serving_figure import ALONE, BATCHED, LABELS, write_figures
+from benchmarks.chain.process import CHECKOUT, END_PATIENCE_S, free_port
+from benchmarks.footprint import memory
+from benchmarks.load.ages import Came, age_row
+from benchmarks.load.asking import CAMERA_HZ, Asked
+from benchmarks.load.declared_cost import CAMERAS
+from benchmarks.load.serving_figure import ALONE, BATCHED, LABELS, LEROBOT, write_figures
 from benchmarks.picture import noisy_picture
 from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.node import Node
@@ -40,6 +48,8 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind, worker_node
 from vla_zenoh.lab.cli.options import number_list
 from vla_zenoh.nodes.camera.camera_publisher import CameraPublisher
+from vla_zenoh.policy import CameraSpec
+from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import Profile, as_robot, load_profile, override, to_yaml
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.runtime.supervisor import NodeCommand, Supervisor
@@ -47,8 +57,10 @@ from vla_zenoh.types import ActionChunk, Task
 
 MODEL, WORKER = Path(__file__).parent / "declared_cost.py", "declared"
 PROMPT = "hold"
-CAMERA_HZ, TASK_PERIOD_S = 30.0, 0.2
+TASK_PERIOD_S = 0.2
 READY_S, SETTLE_S, POLL_S, STATUS_S = 60.0, 1.0, 0.1, 1.5
+SETTLE_ROUNDS, ROUNDS = 1.5, 4
+"""Of all robots one after another: before it is measured, and how many at least."""
 MAX_CHUNKS = 4096
 MOST = 100
 OLDEST_S = load_profile("panda_sim").timing.max_observation_age_s
@@ -67,7 +79,10 @@ class Setup:
         growth: share of it that each further robot adds in a batch; None: one robot at a time.
         rate_hz: of inferences, requested by each robot.
         side: width and height of an image.
-        seconds: how long it is measured.
+        seconds: how long it is measured at least.
+        cameras: of each robot.
+        jpeg: images travel as JPEG of the model's size, and nothing in shared memory, as to a
+            worker on another host.
     """
 
     robots: int
@@ -76,49 +91,47 @@ class Setup:
     rate_hz: float
     side: int
     seconds: float
+    cameras: int = 1
+    jpeg: bool = False
 
+    @property
+    def round_s(self) -> float:
+        """An inference for each robot, one after another."""
+        return self.robots * self.cost_ms / 1e3
 
-@dataclass(slots=True)
-class Ages:
-    """Ages of the chunks of each robot, in ms."""
+    @property
+    def settle_s(self) -> float:
+        """Before it is measured."""
+        return max(SETTLE_S, SETTLE_ROUNDS * self.round_s)
 
-    of_robot: list[list[float]] = field(default_factory=list)
-
-    def row(self, took_s: float, oldest_s: float) -> dict[str, Any]:
-        """Percentiles over all and of the worst robot, the rate of the robot that gets least, and
-        the share that a command node would reject as older than `oldest_s`."""
-        least = min(map(len, self.of_robot))
-        if not least:
-            raise NodeError(f"a robot had no chunk in {took_s:g} s: measure longer (--seconds)")
-        every = np.concatenate([np.asarray(ages) for ages in self.of_robot])
-        p50, p95 = np.percentile(every, [50, 95])
-        worst = max(float(np.percentile(ages, 95)) for ages in self.of_robot)
-        return {
-            "age_p50_ms": round(float(p50), 1),
-            "age_p95_ms": round(float(p95), 1),
-            "worst_robot_p95_ms": round(worst, 1),
-            "chunks": len(every),
-            "chunks_hz": round(least / took_s, 2),
-            "too_old": round(float(np.mean(every > 1e3 * oldest_s)), 3),
-        }
+    @property
+    def measured_s(self) -> float:
+        """How long it is measured."""
+        return max(self.seconds, ROUNDS * self.round_s)
 
 
 class Meter:
     """Cores that processes take, and the computer as a whole, from now on."""
 
-    def __init__(self, pids: dict[str, int]) -> None:
+    def __init__(self, pids: dict[str, list[int]]) -> None:
         self._pids = pids
         self._began_s, self._spent, self._busy_s = time.monotonic(), self._now(), busy_s()
 
     def _now(self) -> dict[str, float]:
-        return {name: cpu_s(pid) for name, pid in self._pids.items()}
+        return {name: sum(map(cpu_s, pids)) for name, pids in self._pids.items()}
 
     def row(self) -> dict[str, Any]:
-        """What a result has of it."""
+        """What a result has of it; memory is what a process has for itself alone."""
         took_s, now = time.monotonic() - self._began_s, self._now()
-        cores = {name: round((now[name] - self._spent[name]) / took_s, 2) for name in now}
+        cores = {name: round((now[name] - self._spent[name]) / took_s, 3) for name in now}
         busy = round((busy_s() - self._busy_s) / took_s, 2)
-        return {"cores": cores, "busy_cores": busy, "host_cores": os.cpu_count() or 1}
+        own = {name: round(sum(map(own_mb, pids)), 1) for name, pids in self._pids.items()}
+        return {"cores": cores, "busy_cores": busy, "host_cores": os.cpu_count() or 1, "mb": own}
+
+
+def own_mb(pid: int) -> float:
+    """Memory of a process that no other one shares."""
+    return memory(pid)["own_mb"]
 
 
 def busy_s() -> float:
@@ -127,60 +140,46 @@ def busy_s() -> float:
     return sum(map(int, (user, nice, system, irq, softirq))) / os.sysconf("SC_CLK_TCK")
 
 
-def frame_time(now_s: float, robot: int, robots: int) -> float:
-    """When a robot's camera took its newest image; the cameras take turns."""
-    shift_s = robot / robots / CAMERA_HZ
-    return shift_s + np.floor((now_s - shift_s) * CAMERA_HZ) / CAMERA_HZ
-
-
 # -- other servers ---------------------------------------------------------------------------------
-def ask_peer(peer: str, setup: Setup, stop: threading.Event) -> dict[str, Any]:
+def ask_peer(peer: str, python: Path, setup: Setup, stop: threading.Event) -> dict[str, Any]:
     """The row of another server; each robot is a client in a thread of its own."""
-    port = free_port()
-    ages = Ages([[] for _ in range(setup.robots)])
-    with Server("peer", peer, str(port), str(setup.cost_ms / 1e3)) as server:
-        server.await_port(port)
-        ended = threading.Event()
-        measured_s = time.monotonic() + SETTLE_S
-        threads = [
-            threading.Thread(target=_ask, args=(peer, setup, index, port, ages, measured_s, ended))
-            for index in range(setup.robots)
-        ]
-        for thread in threads:
-            thread.start()
+    asked = Asked(
+        setup.robots,
+        setup.robots if peer == LEROBOT else 1,
+        setup.cost_ms,
+        setup.rate_hz,
+        setup.side,
+        setup.cameras,
+        setup.settle_s,
+        setup.measured_s,
+    )
+    command = [str(python), "-m", "benchmarks.load.asking", peer, asked.text()]
+    with ExitStack() as up:
+        # LeRobot writes logs where it is started.
+        folder = Path(up.enter_context(tempfile.TemporaryDirectory(prefix="vla-zenoh-serving-")))
+        said = up.enter_context((folder / "said").open("wb+"))
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env={**os.environ, "PYTHONPATH": str(CHECKOUT)},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=said,
+        )
+        assert process.stdout is not None
+        up.callback(process.wait, END_PATIENCE_S)
+        up.callback(process.kill)  # its servers end with it
+        lines = map(json.loads, up.enter_context(process.stdout))
         try:
-            _wait(SETTLE_S, stop)
-            meter = Meter({"server": server.pid, "robots": os.getpid()})
-            _wait(setup.seconds, stop)
+            pids = next(lines)
+            meter = Meter({"server": pids["servers"], "robots": [pids["robots"]]})
+            _wait(setup.measured_s - SETTLE_S, stop)
             spent = meter.row()
-        finally:
-            ended.set()
-            for thread in threads:
-                thread.join()
-    return ages.row(setup.seconds, OLDEST_S) | spent
-
-
-def _ask(
-    peer: str,
-    setup: Setup,
-    index: int,
-    port: int,
-    ages: Ages,
-    measured_s: float,
-    ended: threading.Event,
-) -> None:
-    client = peers.load(peer).Client(port)
-    picture = [noisy_picture(setup.side, setup.side)]
-    due_s = time.monotonic()
-    while not ended.wait(max(due_s - time.monotonic(), 0.0)):
-        began_s = time.monotonic()
-        taken_s = frame_time(began_s, index, setup.robots)
-        client.request(picture)
-        now_s = time.monotonic()
-        if now_s >= measured_s and not ended.is_set():
-            ages.of_robot[index].append(1e3 * (now_s - taken_s))
-        due_s = max(due_s + 1 / setup.rate_hz, began_s)
-    client.close()
+            found = next(lines)
+        except StopIteration:
+            told = (folder / "said").read_text("utf-8", "replace")
+            raise NodeError(f"{peer}'s robots or server have ended: {told[-2000:]}") from None
+    return age_row(found["came"], setup.measured_s, OLDEST_S) | spent
 
 
 # -- our worker ------------------------------------------------------------------------------------
@@ -193,9 +192,15 @@ class Robots:
         commands = [Node("command", profile, session) for profile in profiles]
         self._tasks = [node.declare_publisher(node.keys.task, Kind.STATE) for node in commands]
         self._cameras = [
-            CameraPublisher("front", profile.cameras["front"], "benchmark", node, node.emit)
+            [
+                CameraPublisher(name, profile.cameras[name], "benchmark", node, node.emit)
+                for name in CAMERAS[: setup.cameras]
+            ]
             for profile, node in zip(profiles, self.nodes, strict=True)
         ]
+        if setup.jpeg:
+            for camera in (camera for cameras in self._cameras for camera in cameras):
+                camera.fitted.serve(fitted_size(camera.name, setup.side))
         self._chunks = [
             node.subscribe(node.keys.delta(WORKER), CallbackRing(MAX_CHUNKS)) for node in self.nodes
         ]
@@ -216,24 +221,27 @@ class Robots:
                     tasks.publish(task)
                 task_s = time.monotonic() + TASK_PERIOD_S
             mono_ns, wall_ns = time.monotonic_ns(), self.nodes[index].clock.wall_ns()
-            camera = self._cameras[index]
-            camera.captured(mono_ns)
-            camera.publish_rgb(self._pictures[number % 2], mono_ns, wall_ns)
+            for camera in self._cameras[index]:
+                camera.captured(mono_ns)
+                camera.publish_rgb(self._pictures[number % 2], mono_ns, wall_ns)
             turn += 1
 
     def answered(self) -> bool:
         """Whether each robot has a chunk that was not counted yet."""
         return all(chunks.has_new for chunks in self._chunks)
 
-    def ages(self) -> Ages:
-        """Ages of the chunks since the last call."""
-        found = Ages()
+    def came(self) -> Came:
+        """Of each robot, when an image was taken and its chunk came, since the last call."""
+        found = []
         for node, chunks in zip(self.nodes, self._chunks, strict=True):
             behind_ns = node.clock.wall_ns() - time.monotonic_ns()
             every = [(arrival, node.decode(ActionChunk, arrival)) for arrival in chunks.drain()]
-            found.of_robot.append(
+            found.append(
                 [
-                    (arrival.mono_ns + behind_ns - chunk.record.observation_stamp_ns) / 1e6
+                    (
+                        (chunk.record.observation_stamp_ns - behind_ns) / 1e9,
+                        arrival.mono_ns / 1e9,
+                    )
                     for arrival, chunk in every
                     if chunk is not None
                 ]
@@ -258,9 +266,47 @@ class Robots:
             node.close()
 
 
+def fitted_size(camera: str, side: int) -> dict[str, CameraSpec]:
+    """The size that the model asks for, by the name of its stream."""
+    spec = CameraSpec(camera=camera, width=side, height=side, resize="pad")
+    return {str(size_variant(spec)): spec}
+
+
+class Link(NamedTuple):
+    """What a process has sent and received on its TCP connections, bytes."""
+
+    sent: int
+    received: int
+
+
+def link_of(pid: int) -> Link:
+    """Of a process so far, as ``ss`` tells.
+
+    Raises:
+        NodeError: ``ss`` (iproute2) is missing.
+    """
+    try:
+        told = subprocess.run(["ss", "-tinpHO"], capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise NodeError(f"--jpeg counts bytes with ss of iproute2: {error}") from error
+    return read_link(told, pid)
+
+
+def read_link(told: str, pid: int) -> Link:
+    """The sums of a process over the lines of ``ss``."""
+    mine = [line for line in told.splitlines() if f"pid={pid}," in line]
+    sent, received = (
+        sum(int(count) for line in mine for count in re.findall(rf"\b{word}:(\d+)", line))
+        for word in ("bytes_sent", "bytes_received")
+    )
+    return Link(sent, received)
+
+
 def model_options(setup: Setup) -> dict[str, str]:
     """Of the model of declared cost."""
-    cost = {"cost_ms": f"{setup.cost_ms:g}"}
+    cost = {"cost_ms": f"{setup.cost_ms:g}", "cameras": str(setup.cameras)}
+    if setup.jpeg:
+        cost["side"] = str(setup.side)
     if setup.growth is None:
         return cost | {"max_batch": "1"}
     return cost | {"growth": f"{setup.growth:g}"}
@@ -269,14 +315,22 @@ def model_options(setup: Setup) -> dict[str, str]:
 def bench_profile(setup: Setup, endpoint: str, names: Sequence[str]) -> Profile:
     """The profile of the first robot, whose worker serves all."""
     shipped = load_profile("panda_sim")
-    front = {"width": setup.side, "height": setup.side, "rate_hz": CAMERA_HZ}
-    others = {name: None for name in shipped.cameras if name != "front"}
+    camera = {
+        "source": "sim:front",
+        "width": setup.side,
+        "height": setup.side,
+        "rate_hz": CAMERA_HZ,
+        "fit_for_workers": setup.jpeg,
+    }
+    none: dict[str, Any] = dict.fromkeys(shipped.cameras)
+    cameras = none | dict.fromkeys(CAMERAS[: setup.cameras], camera)
+    session = {"listen": [endpoint], "connect": [endpoint], "shared_memory": not setup.jpeg}
     return override(
         shipped,
         {
             "robot": {"name": names[0]},
-            "session": {"listen": [endpoint], "connect": [endpoint]},
-            "cameras": {"front": front, **others},
+            "session": session,
+            "cameras": cameras,
             "task": {"worker": WORKER, "rate_hz": setup.rate_hz},
             "workers": [WORKER],
             "models": {WORKER: str(MODEL)},
@@ -297,12 +351,16 @@ def serve_ours(
         folder = up.enter_context(tempfile.TemporaryDirectory(prefix="vla-zenoh-serving-"))
         file = Path(folder) / "robots.yaml"
         file.write_text(to_yaml(profile), "utf-8")
-        router = up.enter_context(Server("router", endpoint))
-        session = up.enter_context(open_session(profile.session, wait_s=ROUTER_PATIENCE_S))
-        arguments = ("worker", WORKER, "--profile", str(file), "--images", "raw")
-        supervisor = Supervisor([NodeCommand("worker", "worker", arguments)], log=log, tell=log)
+        images = "jpeg" if setup.jpeg else "raw"
+        where = ("--profile", str(file))
+        commands = [
+            NodeCommand("router", "router", ("node", "router", *where)),
+            NodeCommand("worker", "worker", ("worker", WORKER, *where, "--images", images)),
+        ]
+        supervisor = Supervisor(commands, log=log, tell=log)
         supervisor.start()
         up.callback(supervisor.kill)
+        session = up.enter_context(open_session(profile.session, wait_s=ROUTER_PATIENCE_S))
         robots = Robots(setup, [as_robot(profile, name) for name in names], session)
         up.callback(robots.close)
         ended = threading.Event()
@@ -315,13 +373,24 @@ def serve_ours(
             if not supervisor.poll() or time.monotonic() > give_up_s:
                 raise NodeError(f"the worker does not answer every robot: {robots.complaint()}")
             _wait(POLL_S, stop)
-        _wait(SETTLE_S, stop)
-        robots.ages()
-        (worker,) = supervisor.pids().values()
-        meter = Meter({"router": router.pid, "worker": worker, "robots": os.getpid()})
-        _wait(setup.seconds, stop)
+        _wait(setup.settle_s, stop)
+        robots.came()
+        pids = supervisor.pids()
+        worker = pids["worker"]
+        before = link_of(worker) if setup.jpeg else None
+        meter = Meter({"router": [pids["router"]], "worker": [worker], "robots": [os.getpid()]})
+        _wait(setup.measured_s, stop)
         spent = meter.row()
-        return robots.ages().row(setup.seconds, OLDEST_S) | spent
+        if before is not None:
+            after = link_of(worker)
+            spent["to_worker_kb_s"], spent["from_worker_kb_s"] = (
+                round((now - then) / 1e3 / setup.measured_s, 1)
+                for now, then in (
+                    (after.received, before.received),
+                    (after.sent, before.sent),
+                )
+            )
+        return age_row(robots.came(), setup.measured_s, OLDEST_S) | spent
 
 
 def _wait(seconds: float, stop: threading.Event) -> None:
@@ -352,6 +421,18 @@ def serving(
     side: Annotated[
         int, typer.Option("--side", min=32, max=1024, help="Width and height of an image.")
     ] = 224,
+    cameras: Annotated[str, typer.Option("--cameras", help="Numbers of cameras of a robot.")] = "1",
+    jpeg: Annotated[
+        bool,
+        typer.Option(
+            "--jpeg",
+            help="Send our worker JPEG without shared memory, as to another host; count bytes.",
+        ),
+    ] = False,
+    lerobot: Annotated[
+        Path | None,
+        typer.Option("--lerobot", help="Python of an environment with lerobot[async]."),
+    ] = None,
     seconds: Annotated[
         float, typer.Option("--seconds", min=2, max=600, help="How long each is measured.")
     ] = 8.0,
@@ -360,7 +441,8 @@ def serving(
         typer.Option("--show", help="Measure nothing, show this result; repeatable."),
     ] = None,
     pictures: Annotated[
-        Path | None, typer.Option("--pictures", help="Folder for the curves, as SVG and PDF.")
+        Path | None,
+        typer.Option("--pictures", help="Folder for the curves: SVG, PNG and PDF, in two widths."),
     ] = None,
 ) -> None:
     """Measure the age of chunks as robots of one model become more, beside other servers.
@@ -374,30 +456,38 @@ def serving(
         raise typer.BadParameter(f"--only {', '.join(unknown)}: it is one of {', '.join(LABELS)}")
     if earlier:
         rows = [row for file in earlier for row in json.loads(file.read_text("utf-8"))]
+        compare(rows)
         _show(output, rows, pictures)
         return
     counts = sorted({int(count) for count in number_list("--robots", robots, 1, MOST)})
     costs = number_list("--model-ms", model_ms, 1, 10_000)
+    numbers = sorted({int(n) for n in number_list("--cameras", cameras, 1, len(CAMERAS))})
+    chosen = only or [way for way in LABELS if lerobot is not None or way != LEROBOT]
+    if lerobot is None and LEROBOT in chosen:
+        raise typer.BadParameter("LeRobot's server needs --lerobot PYTHON")
     shares = number_list("--growth", growth, 0, 1)
     stop = stop_on_signals()
     die_with_parent()
     with kept_rows(output) as rows:
-        for cost_ms in costs:
-            for way, share in _ways(only or list(LABELS), shares):
-                for count in counts:
-                    if count == 1 and share not in (None, shares[0]):
-                        continue  # a batch of one has no share
-                    setup = Setup(count, cost_ms, share, rate_hz, side, seconds)
-                    what = {"way": way, "robots": count, "model_ms": cost_ms, "growth": share}
-                    ours = way in (BATCHED, ALONE)
-                    found = (
-                        serve_ours(setup, stop, rows.log) if ours else ask_peer(way, setup, stop)
-                    )
-                    rows.append(what | {"seconds": seconds} | found)
-                    errors().print(f"{way}, {count} robots measured", style="dim")
-                    if full := fullest(rows[-1]):
-                        errors().print(f"the processors are full, most of it {full}")
-                        break
+        for cost_ms, count_of_cameras, (way, share) in product(
+            costs, numbers, _ways(chosen, shares)
+        ):
+            for count in counts:
+                if count == 1 and share not in (None, shares[0]):
+                    continue  # a batch of one has no share
+                setup = Setup(count, cost_ms, share, rate_hz, side, seconds, count_of_cameras, jpeg)
+                if way in (BATCHED, ALONE):
+                    found = serve_ours(setup, stop, rows.log)
+                else:
+                    python = lerobot if way == LEROBOT and lerobot else Path(sys.executable)
+                    found = ask_peer(way, python, setup, stop)
+                what = {"way": way, "robots": count, "model_ms": cost_ms, "growth": share}
+                how = {"cameras": count_of_cameras, "side": side, "jpeg": jpeg}
+                rows.append(what | how | {"seconds": setup.measured_s} | found)
+                errors().print(f"{way}, {count} robots measured", style="dim")
+                if full := fullest(rows[-1]):
+                    errors().print(f"the processors are full, most of it {full}")
+                    break
         compare(rows)
     _show(output, rows, pictures)
 
@@ -417,15 +507,15 @@ def fullest(row: dict[str, Any]) -> str:
 
 def compare(rows: list[dict[str, Any]]) -> None:
     """Add to each of our rows its p95 as a share of that of openpi's server."""
-    theirs = {
-        (row["robots"], row["model_ms"]): row["age_p95_ms"]
-        for row in rows
-        if row["way"] == "openpi"
-    }
+    theirs = {_served(row): row["age_p95_ms"] for row in rows if row["way"] == "openpi"}
     for row in rows:
-        other = theirs.get((row["robots"], row["model_ms"]))
+        other = theirs.get(_served(row))
         if row["way"] in (BATCHED, ALONE) and other is not None:
             row["p95_of_openpi"] = round(row["age_p95_ms"] / other, 2)
+
+
+def _served(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in ("robots", "model_ms", "cameras", "side"))
 
 
 def _show(output: ResultOptions, rows: list[dict[str, Any]], pictures: Path | None) -> None:
@@ -434,30 +524,36 @@ def _show(output: ResultOptions, rows: list[dict[str, Any]], pictures: Path | No
     order = list(LABELS)
     table = Table(box=SIMPLE, pad_edge=False)
     for column in (
-        *("c", "robots", "way", "k", "age p50", "p95", "worst robot", "of openpi's"),
-        *("chunks Hz", "too old", "cores", "busy"),
+        *("c", "robots", "cameras", "way", "k", "age p50", "p95", "worst robot", "of openpi's"),
+        *("held p50", "p95", "chunks Hz", "too old", "cores", "MB", "kB/s", "busy"),
     ):
         table.add_column(column, justify="left" if column == "way" else "right")
     for row in sorted(
         rows,
         key=lambda row: (
             row["model_ms"],
+            row["cameras"],
+            row["side"],
             row["robots"],
             order.index(row["way"]),
             row["growth"] or 0,
         ),
     ):
-        cores = ", ".join(f"{name} {share:g}" for name, share in row["cores"].items())
+        cores = ", ".join(f"{name} {share:.2f}" for name, share in row["cores"].items())
         table.add_row(
             f"{row['model_ms']:g} ms",
             str(row["robots"]),
+            f"{row['cameras']} of {row['side']}" + (", JPEG" if row["jpeg"] else ""),
             row["way"],
             "" if row["growth"] is None else f"{row['growth']:g}",
             *(f"{row[name]:.0f} ms" for name in ("age_p50_ms", "age_p95_ms", "worst_robot_p95_ms")),
             f"{row['p95_of_openpi']:g}" if "p95_of_openpi" in row else "",
+            *(f"{row[name]:.0f} ms" for name in ("held_p50_ms", "held_p95_ms")),
             f"{row['chunks_hz']:g}",
             f"{row['too_old']:.0%}",
             cores,
+            ", ".join(f"{name} {mb:.0f}" for name, mb in row["mb"].items()),
+            f"{row['to_worker_kb_s']:.0f}" if row["jpeg"] and "to_worker_kb_s" in row else "",
             f"{row['busy_cores']:g} of {row['host_cores']}",
         )
     output.show(rows, table)

@@ -14,7 +14,13 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-MODULES = {"flask": "flask_json", "openpi": "openpi_websocket", "zmq": "zmq_msgpack"}
+MODULES = {
+    "flask": "flask_json",
+    "openpi": "openpi_websocket",
+    "zmq": "zmq_msgpack",
+    "groot": "groot_zmq",
+    "lerobot": "lerobot_grpc",
+}
 ADDRESS = "127.0.0.1"
 ACTION = (0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04)
 """What every server answers."""
@@ -28,8 +34,8 @@ Pictures = Sequence[NDArray[np.uint8]]
 class PeerClient(Protocol):
     """Client side of a server."""
 
-    def request(self, pictures: Pictures) -> NDArray[Any]:
-        """Send images; returns seven floats."""
+    def request(self, pictures: Pictures) -> NDArray[Any] | None:
+        """Send images; returns seven floats, or None where they are of another robot's images."""
         ...
 
     def close(self) -> None: ...

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks.load import declared_cost
-from benchmarks.load.serving import CAMERA_HZ, Ages, compare, frame_time, fullest
+from benchmarks.load.ages import age_row
+from benchmarks.load.asking import CAMERA_HZ, frame_time
+from benchmarks.load.serving import Link, Setup, ask_peer, compare, fullest, read_link
 from benchmarks.load.serving_figure import write_figures
 from vla_zenoh.errors import NodeError
 from vla_zenoh.policy import Observation
@@ -22,6 +26,10 @@ def row(way: str, robots: int, p95_ms: float, growth: float | None = None) -> di
         "model_ms": 80.0,
         "growth": growth,
         "age_p95_ms": p95_ms,
+        "held_p95_ms": 2 * p95_ms,
+        "cameras": 1,
+        "side": 224,
+        "jpeg": False,
         "cores": {"router": 0.2, "robots": 0.5},
         "host_cores": 2,
     }
@@ -39,13 +47,48 @@ def test_an_inference_takes_what_the_model_declares(
     assert len(answers) == robots
 
 
-def test_ages_are_of_all_robots_and_a_robot_without_a_chunk_is_an_error() -> None:
-    found = Ages([[100.0] * 9, [300.0, 1200.0]]).row(took_s=2.0, oldest_s=1.0)
+def test_ages_are_of_all_robots_and_a_robot_without_chunks_is_an_error() -> None:
+    quick = [(number / 10, number / 10 + 0.1) for number in range(9)]
+    slow = [(0.0, 0.3), (0.0, 1.2)]
+    found = age_row([quick, slow], took_s=2.0, oldest_s=1.0)
     assert (found["age_p50_ms"], found["chunks"], found["chunks_hz"]) == (100.0, 11, 1.0)
     assert found["worst_robot_p95_ms"] > found["age_p95_ms"] > 300.0
+    assert found["robots_p50_p95_ms"][0] == [100.0, 100.0]
     assert found["too_old"] == pytest.approx(1 / 11, abs=1e-3)
-    with pytest.raises(NodeError, match="no chunk"):
-        Ages([[100.0], []]).row(2.0, 1.0)
+    with pytest.raises(NodeError, match="had 1 chunk"):
+        age_row([quick, slow[:1]], 2.0, 1.0)
+
+
+def test_what_a_robot_has_gets_older_until_the_next_chunk_even_if_that_is_of_an_older_image() -> (
+    None
+):
+    found = age_row([[(1.0, 1.1), (0.9, 1.5), (2.0, 2.1)]], took_s=2.0, oldest_s=1.0)
+    assert found["held_p50_ms"] == pytest.approx(600.0, abs=10.0)
+    assert found["held_p95_ms"] == pytest.approx(1050.0, abs=10.0)
+
+
+def test_bytes_of_a_process_are_those_of_all_its_connections() -> None:
+    told = (
+        'ESTAB 0 0 127.0.0.1:1 127.0.0.1:2 users:(("a",pid=7,fd=3)) bytes_sent:5 bytes_received:2\n'
+        'ESTAB 0 0 127.0.0.1:2 127.0.0.1:1 users:(("b",pid=71,fd=3)) bytes_sent:9\n'
+        'ESTAB 0 0 127.0.0.1:3 127.0.0.1:4 users:(("a",pid=7,fd=4)) bytes_received:40\n'
+    )
+    assert read_link(told, 7) == Link(sent=5, received=42)
+
+
+@pytest.mark.parametrize("peer", ["openpi", "groot"])
+def test_robots_of_another_server_wait_for_each_other(peer: str) -> None:
+    setup = Setup(2, 80.0, None, 10.0, 64, 2.0, cameras=2)
+    found = ask_peer(peer, Path(sys.executable), setup, threading.Event())
+    assert found["age_p50_ms"] > 130.0  # alone it is at most 80 and a camera's period
+    assert len(found["robots_p50_p95_ms"]) == 2
+    assert set(found["cores"]) == {"server", "robots"}
+
+
+def test_a_server_whose_library_is_missing_is_an_error_that_names_it() -> None:
+    setup = Setup(1, 50.0, None, 10.0, 64, 2.0)
+    with pytest.raises(NodeError, match="lerobot"):
+        ask_peer("lerobot", Path(sys.executable), setup, threading.Event())
 
 
 def test_cameras_take_turns_and_a_robot_asks_with_its_newest_image() -> None:
@@ -72,12 +115,14 @@ def test_the_figure_has_a_curve_for_each_way_but_the_one_that_lies_on_another(
 ) -> None:
     rows = [
         row(way, robots, 100.0 * robots, growth)
-        for way, growth in (("openpi", None), ("zmq", None), ("alone", None), ("batched", 0.5))
+        for way, growth in (("openpi", None), ("groot", None), ("alone", None), ("batched", 1.0))
         for robots in (1, 8)
     ]
     files = write_figures(tmp_path, rows)
-    assert {file.name for file in files} == {"serving.svg", "serving.pdf"}
-    drawn = (tmp_path / "serving.svg").read_text("utf-8")
-    for name in ("openpi's server", "one robot at a time", "vla-zenoh, k = 0.5"):
+    assert {file.name for file in files} == {
+        f"serving{width}.{kind}" for width in ("", "_page") for kind in ("svg", "png", "pdf")
+    }
+    drawn = (tmp_path / "serving_page.svg").read_text("utf-8")
+    for name in ("openpi's server", "one robot at a time", "vla-zenoh, k = 1", "while it is held"):
         assert name in drawn
     assert "ZeroMQ" not in drawn
