@@ -13,8 +13,8 @@ from vla_zenoh.bus.node import Node, publish_together
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.keys import Kind
-from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.kinematics.so3 import quat_from_rotation
+from vla_zenoh.kinematics.kinematics import InverseKinematics, make_kinematics
+from vla_zenoh.kinematics.so3 import pose_of, quat_from_rotation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.types import GripperState, JointState, PoseCommand, PoseState
@@ -26,8 +26,8 @@ def play_robot(profile_file: str, stop: threading.Event, *, follows: bool) -> No
     Args:
         profile_file: of the robot.
         stop: set to stop it.
-        follows: the newest commanded pose is the measured one; otherwise the arm stands at home and
-            receives nothing.
+        follows: the newest commanded pose is the measured one, with joints that reach it; otherwise
+            the arm stands at home and receives nothing.
     """
     profile = load_profile(profile_file)
     robot = profile.robot
@@ -35,6 +35,7 @@ def play_robot(profile_file: str, stop: threading.Event, *, follows: bool) -> No
     home = kinematics.forward(kinematics.ordered(robot.arm_joints, robot.home_rad))
     still = np.zeros(len(robot.arm_joints))
     joints = JointState(robot.arm_joints, np.array(robot.home_rad), still, still)
+    inverse = InverseKinematics(kinematics, kinematics.ordered(joints.names, joints.position_rad))
     pose = PoseState(home.position_m, quat_from_rotation(home.rotation), np.zeros(6))
     gripper = GripperState(robot.gripper.max_width_m, moving=False, holding=False)
     with open_session(profile.session, wait_s=ROUTER_PATIENCE_S) as session:
@@ -53,6 +54,10 @@ def play_robot(profile_file: str, stop: threading.Event, *, follows: bool) -> No
             if order is not None:
                 told = order.record
                 pose = PoseState(told.position_m, told.quat_xyzw, told.twist)
+                before_rad = kinematics.joints_of(joints)
+                found = inverse.approach(pose_of(pose), before_rad).joints_rad
+                moved = (found - before_rad) * profile.timing.state_hz
+                joints = JointState(kinematics.arm_joints, found, moved, still)
             states = (poses, pose), (arms, joints), (grippers, gripper)
             publish_together(node.clock.wall_ns(), poses.seq, *states)
             rate.tick()

@@ -28,14 +28,24 @@ def load(
     seconds: Annotated[
         float, typer.Option("--seconds", min=3, max=600, help="How long at each number.")
     ] = 10.0,
+    model_ms: Annotated[
+        float | None,
+        typer.Option(
+            "--model-ms", min=1, help="Cost c of an inference; default: the scripted model."
+        ),
+    ] = None,
+    growth: Annotated[
+        float, typer.Option("--growth", min=0, max=1, help="Share k that each further robot adds.")
+    ] = 0.15,
     profile: Annotated[
         str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
     ] = DEFAULT_PROFILE,
 ) -> None:
     """Measure how many robots and cameras one router and this computer carry.
 
-    Robots follow their commands without a simulator; one worker serves all of them. Cameras send
-    images of 640x480, which are read raw.
+    Robots follow their commands without a simulator; one worker serves all of them, with --model-ms
+    a model that costs c (1 + k (n - 1)) for n robots at once. Cameras send images of 640x480, which
+    are read raw.
     """
     from benchmarks.load.runner import Load
     from vla_zenoh.lab.cli.loopback import own_address
@@ -45,11 +55,14 @@ def load(
     stop = stop_on_signals()
     die_with_parent()
     loaded = own_address(effective_profile(profile))
+    declared = None
+    if model_ms is not None:
+        declared = {"cost_ms": f"{model_ms:g}", "growth": f"{growth:g}"}
     with kept_rows(output) as rows:
         for counts, make in ((robot_counts, "robots"), (camera_counts, "cameras")):
             if not counts:
                 continue
-            with Load(loaded, stop, rows.log) as running:
+            with Load(loaded, stop, rows.log, declared) as running:
                 for row in getattr(running, make)(counts, seconds):
                     rows.append(row)
                     errors().print(f"{row[make]} {make} measured", style="dim")

@@ -20,7 +20,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 
-HORIZON, DT_S = 10, 0.1
+HORIZON, DT_S, STEP_M = 10, 0.1, 0.005
 CAMERAS = ("front", "wrist", "side")
 
 
@@ -31,7 +31,7 @@ class DeclaredCost:
         cost_ms: c, of one robot.
         growth: k, the share of it that each further robot adds; 1: batching gains nothing.
         max_batch: robots in one inference; 0: all.
-        cameras: images of an observation.
+        cameras: images of an observation; 0: it sees the arm, which it moves up and down.
         side: their width and height; 0: any.
     """
 
@@ -44,6 +44,9 @@ class DeclaredCost:
         side: str = "0",
     ) -> None:
         self._cost_s, self._growth = float(cost_ms) / 1e3, float(growth)
+        self._steps = np.zeros((HORIZON, 6))
+        if cameras == "0":
+            self._steps[:, 2] = STEP_M * np.resize((1, -1), HORIZON)
         self.max_batch = int(max_batch)
         size = int(side) or None
         seen = tuple(
@@ -52,7 +55,7 @@ class DeclaredCost:
         )
         self.spec = ModelSpec(
             name="declared",
-            observation=ObservationSpec(cameras=seen, state=()),
+            observation=ObservationSpec(cameras=seen, state=() if seen else ("pose",)),
             action=ActionSpec(horizon=HORIZON, dt_s=DT_S, gripper="none"),
         )
 
@@ -64,4 +67,4 @@ class DeclaredCost:
         """The steps of each, after the time for all."""
         # It sleeps: a model on a GPU leaves the processor to the others.
         time.sleep(self._cost_s * (1 + self._growth * (len(observations) - 1)))
-        return [ActionSteps(np.zeros((HORIZON, 6))) for _ in observations]
+        return [ActionSteps(self._steps) for _ in observations]

@@ -25,7 +25,8 @@ SIZES_IN = {"": COLUMN_IN, "_page": PAGE_IN}
 """What the name of a file has -> its width."""
 HEIGHT_IN, KINDS = 1.6, ("svg", "png", "pdf")
 TICKS_MS = (20, 50, 100, 200, 500, 1000, 2000, 5000)
-AGES = {"age_p95_ms": "age on arrival, p95 (ms)", "held_p95_ms": "age while it is held, p95 (ms)"}
+AGES = {"age_p95_ms": "on arrival, p95 (ms)", "held_p95_ms": "held, p95 (ms)"}
+ROOM = 1.25
 CAPTION = (
     "Age of a chunk, from the camera's stamp to its arrival at the robot, and of the newest image "
     "that a robot has a chunk of, at any time; over the robots of one model of cost "
@@ -72,6 +73,8 @@ def age_over_robots(rows: Sequence[Mapping[str, Any]], width_in: float) -> Drawn
         for cost_ms, axis in zip(costs, axes, strict=True):
             chosen = [row for row in rows if row["model_ms"] == cost_ms]
             _draw(axis, chosen, curves, age)
+            seen = [row[age] for row in (rows if wide else chosen)]
+            axis.set_ylim(min(seen) / ROOM, max(seen) * ROOM)
             if not wide or cost_ms == costs[0]:
                 axis.set_ylabel(AGES[age])
             if age == next(iter(AGES)):

@@ -123,6 +123,6 @@ def test_the_figure_has_a_curve_for_each_way_but_the_one_that_lies_on_another(
         f"serving{width}.{kind}" for width in ("", "_page") for kind in ("svg", "png", "pdf")
     }
     drawn = (tmp_path / "serving_page.svg").read_text("utf-8")
-    for name in ("openpi's server", "one robot at a time", "vla-zenoh, k = 1", "while it is held"):
+    for name in ("openpi's server", "one robot at a time", "vla-zenoh, k = 1", "held, p95 (ms)"):
         assert name in drawn
     assert "ZeroMQ" not in drawn
