@@ -31,7 +31,7 @@ from rich.table import Table
 from vla_zenoh_benchmarks.command_runner import cpu_s
 from vla_zenoh_benchmarks.result_file import ResultOptions, kept_rows
 
-from benchmarks.chain.process import CHECKOUT, END_PATIENCE_S, free_port
+from benchmarks.chain.process import CHECKOUT, free_port
 from benchmarks.footprint import memory
 from benchmarks.load.ages import Came, age_row
 from benchmarks.load.asking import CAMERA_HZ, Asked
@@ -167,7 +167,7 @@ def ask_peer(peer: str, python: Path, setup: Setup, stop: threading.Event) -> di
             stderr=said,
         )
         assert process.stdout is not None
-        up.callback(process.wait, END_PATIENCE_S)
+        up.callback(process.wait, READY_S)
         up.callback(process.kill)  # its servers end with it
         lines = map(json.loads, up.enter_context(process.stdout))
         try:
