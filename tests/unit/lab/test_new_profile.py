@@ -17,13 +17,14 @@ from vla_zenoh_newarm.arm import Arm, JointMotion
 from vla_zenoh_newarm.gripper import Gripper, gripper
 from vla_zenoh_newarm.mended import Mended
 from vla_zenoh_newarm.picture import outline, picture
-from vla_zenoh_newarm.posture import Posture
+from vla_zenoh_newarm.posture import INNER, Posture, posture
 from vla_zenoh_newarm.structure import structure
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.collision import CollisionModel
 from vla_zenoh.kinematics.description import Description
 from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.profile import ReachLimits
 from vla_zenoh.program.main import app
 
 SHIPPED = Path(__file__).parents[3] / "profiles"
@@ -298,6 +299,16 @@ def test_enter_keeps_a_guess_unconfirmed_and_another_answer_confirms(
 
 
 # -- the picture ----------------------------------------------------------------------------------
+def test_a_home_with_the_tool_down_is_away_from_the_ends_of_every_joint(tmp_path: Path) -> None:
+    file = tmp_path / "arm.urdf"
+    stiff = Row("j4", axis=Y, ends=(-1.0, 1.0))
+    file.write_text(urdf([*arm("zyyyz", j4=stiff), TOOL]))
+    kinematics = Kinematics(file, "tcp", JOINTS_6[:5])
+    home_rad = np.array(posture(kinematics, ReachLimits(table_z_m=0.0), ()).home_rad)
+    middle = (kinematics.lower_rad + kinematics.upper_rad) / 2
+    assert (np.abs(home_rad - middle) < INNER * (kinematics.upper_rad - middle)).all()
+
+
 def test_the_outline_of_points_leaves_out_those_inside() -> None:
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     inside = np.random.default_rng(2).uniform(0.01, 0.99, (50, 2))

@@ -78,8 +78,9 @@ def posture(kinematics: Kinematics, reach: ReachLimits, home_rad: Sequence[float
     if home_rad:
         home = np.array(home_rad, float)
     else:
+        within = middle - INNER * half, middle + INNER * half
         inner = middle + INNER * half * shares
-        home, free, touching = _home(kinematics, reach, inner, table_m, reach_m)
+        home, free, touching = _home(kinematics, reach, inner, within, table_m, reach_m)
     at_m = kinematics.forward(home).position_m
     edges = np.quantile(places_m, (1 - REACH_SHARE, REACH_SHARE), axis=0)
     lower = np.minimum(np.floor(edges[0] * 20) / 20, at_m - MARGIN_M)
@@ -95,13 +96,17 @@ def _home(
     kinematics: Kinematics,
     reach: ReachLimits,
     samples_rad: FloatArray,
+    within_rad: tuple[FloatArray, FloatArray],
     table_m: float,
     reach_m: float,
 ) -> tuple[FloatArray, bool, tuple[tuple[str, str], ...]]:
     """The best of the samples that is near nothing; whether there is one; links that may touch."""
     scores = np.array([_score(kinematics, each, table_m, reach_m) for each in samples_rad])
     homes = np.round(samples_rad[np.argsort(-scores)[:BEST]], 2)
-    down = [found for home in homes[:TURNED] if (found := _turned_down(kinematics, home))]
+    turned = [found for home in homes[:TURNED] if (found := _turned_down(kinematics, home))]
+    # One at the end of a joint's range has no way up.
+    low, high = within_rad
+    down = [home for home in turned if np.all((low < home) & (home < high))]
     down.sort(key=lambda home: -_score(kinematics, np.array(home), table_m, reach_m))
     homes = np.array([*down, *homes.tolist()])
     touching: tuple[tuple[str, str], ...] = ()
