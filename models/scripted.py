@@ -86,8 +86,8 @@ class Scripted:
 
     def reset(self) -> None:
         """Restart the count."""
-        self._last_stamp_ns = -1
-        self._last: list[tuple[float, float]] = [(0.0, 0.0)]
+        self._begun = 0.0, 0.0
+        self._last = [self._begun]
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk of the motion the prompt names."""
@@ -96,7 +96,10 @@ class Scripted:
             raise SpecError(f"{asked.text!r}: {self._no_gripper}")
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
-        begun, place = self._asked_by(observation.stamp_wall_ns, observation.task.speed)
+        # Of a chunk that the arm does not follow no step is executed, and none is counted.
+        if observation.executed_steps is not None:
+            self._begun = self._asked_by(observation.executed_steps)
+        begun, place = self._begun
         horizon, limit = self.spec.action.horizon, asked.steps or math.inf
         ends = [min(begun + index, limit) for index in range(1, horizon + 1)]
         # No step twice: the chunk ends with the one that completes the count.
@@ -108,25 +111,14 @@ class Scripted:
             reached.append((end, place))
             if asked.motion is not None:
                 steps[row, asked.motion.axis] = place - before
-        # Before the arm follows this worker nothing is counted: no step is executed.
-        if observation.task.active:
-            self._last_stamp_ns, self._last = observation.stamp_wall_ns, reached
+        self._last = reached
         return ActionSteps(steps, asked.motion is None or ends[-1] >= limit - ROUNDING)
 
-    def _asked_by(self, stamp_ns: int, speed: float) -> tuple[float, float]:
-        """Steps and distance requested when this observation was taken: the next steps add to them.
-
-        The command node counts in the same way: the first step at once, a later one along its
-        duration.
-        """
-        if self._last_stamp_ns < 0:
-            return 0.0, 0.0
-        dt_ns = int(self.spec.action.dt_s * 1e9)
-        done, part_ns = divmod(round(speed * (stamp_ns - self._last_stamp_ns)), dt_ns)
-        if done < 1:
-            return self._last[0]
+    def _asked_by(self, executed: float) -> tuple[float, float]:
+        """Steps and distance requested by so many steps of the last chunk."""
+        done = math.floor(executed)
         if done >= len(self._last):
             return self._last[-1]
         (steps, place), (later_steps, later_place) = self._last[done - 1], self._last[done]
-        share = part_ns / dt_ns
+        share = executed - done
         return steps + share * (later_steps - steps), place + share * (later_place - place)

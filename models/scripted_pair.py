@@ -142,20 +142,18 @@ class ScriptedPair:
         """Forget the path, as at the start of an episode."""
         self._path: list[Segment] = []
         self._seen = False
-        self._time_s, self._stamp_ns = 0.0, 0
+        self._time_s = 0.0
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next steps of the path."""
         here = self._here(observation)
-        stamp_ns, active = observation.stamp_wall_ns, observation.task.active
+        active = observation.task.active
         wanted = observation.prompt.lower().strip(" .") == "lift the bar"
         if active and self._path:
             # The arms are ahead by as much as chunks are late; if one lags, the path waits.
             ahead = np.array([_at(self._path, time_s) for time_s in self._times_s(0)])
             if np.abs(self._joints(ahead) - self._joints(here)).max(axis=1).min() < MAX_LAG_RAD:
-                passed_s = (stamp_ns - self._stamp_ns) / 1e9
-                self._time_s += min(max(passed_s, 0.0), HORIZON * DT_S) * observation.task.speed
-        self._stamp_ns = stamp_ns
+                self._time_s += (observation.executed_steps or 0.0) * DT_S
         if not self._path or not active:
             self._time_s, self._seen = 0.0, False
             home = self._step([arm.home_rad for arm in self._arms.values()], OPEN_M)

@@ -110,21 +110,19 @@ class ScriptedPick:
     def reset(self) -> None:
         """Forget the path, as at the start of an episode."""
         self._path: list[Waypoint] = []
-        self._time_s, self._stamp_ns = 0.0, 0
+        self._time_s = 0.0
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next steps of the path."""
         assert observation.joint is not None
         assert observation.gripper is not None
         here_rad = self._kinematics.joints_of(observation.joint)
-        stamp_ns, active = observation.stamp_wall_ns, observation.task.active
+        active = observation.task.active
         if active and self._path:
             # The arm is ahead by as much as chunks are late; if it lags, the path waits.
             ahead = np.array([_at(self._path, time_s)[:-1] for time_s in self._times_s(0)])
             if np.abs(ahead - here_rad).max(axis=1).min() < MAX_LAG_RAD:
-                passed_s = (stamp_ns - self._stamp_ns) / 1e9
-                self._time_s += min(max(passed_s, 0.0), HORIZON * DT_S) * observation.task.speed
-        self._stamp_ns = stamp_ns
+                self._time_s += (observation.executed_steps or 0.0) * DT_S
         if not self._path or not active:
             self._time_s = 0.0
             here = Waypoint(here_rad, observation.gripper.width_m, 0.0)

@@ -35,6 +35,8 @@ KEYS = Keys("panda")
 PROFILE = to_yaml(load_profile("panda_sim"))
 ZERO_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
+LATENCY_MS = 31
+"""From an observation to the publication of its chunk."""
 HEIGHT, WIDTH = 48, 64
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 HORIZON, DT_S = 4, 0.1
@@ -125,8 +127,10 @@ def write_run(
             made = ActionChunk(
                 "teacher", said.hash, number + 1, seen_ns, seq, seen_ns + 10**9, steps, *times
             )
-            samples.append(put(KEYS.delta("teacher"), made, seen_ms + 31, seq))
-            cause = Cause("teacher", seq, seen_ns, *times, seen_ns + 31 * MS, seen_ns + 32 * MS)
+            samples.append(put(KEYS.delta("teacher"), made, seen_ms + LATENCY_MS, seq))
+            cause = Cause(
+                "teacher", seq, seen_ns, *times, seen_ns + LATENCY_MS * MS, seen_ns + 32 * MS
+            )
             place = np.array([0.4, 0.0, 0.3])
             still = np.zeros(6)
             command = PoseCommand(place, DOWN, still, still, place, DOWN, "active", cause)
@@ -205,10 +209,10 @@ def write_mixed_run(
                     *(whose, said.hash, number + 1, seen_ns, seq, seen_ns + 10**9, steps),
                     *times,
                 )
-                samples.append(put(KEYS.delta(whose), made, seen_ms + 31, seq))
+                samples.append(put(KEYS.delta(whose), made, seen_ms + LATENCY_MS, seq))
                 if whose == worker:
                     cause = Cause(
-                        *(whose, seq, seen_ns, *times, seen_ns + 31 * MS, seen_ns + 32 * MS)
+                        *(whose, seq, seen_ns, *times, seen_ns + LATENCY_MS * MS, seen_ns + 32 * MS)
                     )
                     samples.append(_command(cause, seen_ms + 33))
     person_ms = (MIXED[1][0], MIXED[1][1])

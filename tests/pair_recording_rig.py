@@ -6,7 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from dataset_rig import CHUNK_MS, CHUNKS, DT_S, HORIZON, MS, ZERO_NS, picture, put, steps_of
+from dataset_rig import (
+    CHUNK_MS,
+    CHUNKS,
+    DT_S,
+    HORIZON,
+    LATENCY_MS,
+    MS,
+    ZERO_NS,
+    picture,
+    put,
+    steps_of,
+)
 
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import JPEG, Sample
@@ -70,10 +81,15 @@ def write_pair_run(path: Path, *, of: ModelSpec | None = None, silent: Sequence[
         steps = steps_of(0, chunk, spec.action.dimension)
         worker = ("pair_model", spec.hash, 1, seen_ns, chunk + 1, seen_ns + 10**9, steps)
         samples.append(
-            put(KEYS.delta("pair_model"), ActionChunk(*worker, *times), seen_ms + 31, 1 + chunk)
+            put(
+                KEYS.delta("pair_model"),
+                ActionChunk(*worker, *times),
+                seen_ms + LATENCY_MS,
+                1 + chunk,
+            )
         )
         cause = Cause(
-            "pair_model", chunk + 1, seen_ns, *times, seen_ns + 31 * MS, seen_ns + 32 * MS
+            "pair_model", chunk + 1, seen_ns, *times, seen_ns + LATENCY_MS * MS, seen_ns + 32 * MS
         )
         for part in SPEED_M_S:
             command = JointCommand(JOINTS, joints_rad(part, seen_ms), still, still, "active", cause)

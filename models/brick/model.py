@@ -146,12 +146,12 @@ class Memory:
     Args:
         hand: at its last observation.
         prompt: of that.
-        asked: when its last chunk was asked for (wall ns), and the (H, 4) goals that it requested.
+        asked: (H, 4) goals that its last chunk requested.
     """
 
     hand: Hand | None = None
     prompt: str = ""
-    asked: tuple[int, FloatArray] | None = None
+    asked: FloatArray | None = None
 
 
 def words_of(prompt: str) -> list[str]:
@@ -304,9 +304,7 @@ class Brick:
                 before = before + step
                 steps[row, MOVED] = step
                 steps[row, 6] = WIDTH_STEP_M if opened else -WIDTH_STEP_M
-        if observation.task.active:
-            goals = goal + np.cumsum(steps[:, MOVED], axis=0)
-            self._memory[observation.robot].asked = (observation.stamp_wall_ns, goals)
+        self._memory[observation.robot].asked = goal + np.cumsum(steps[:, MOVED], axis=0)
         read = waypoints.order if waypoints.understood else "no task"
         return ActionSteps(steps.astype(np.float32), raw={"read": read})
 
@@ -364,10 +362,8 @@ def follow(observation: Observation, last: Hand | None) -> Hand:
     return hand
 
 
-def _goal(
-    observation: Observation, hand: Hand, before: tuple[int, FloatArray] | None
-) -> FloatArray:
-    """(4,) x, y, z, yaw requested when the observation was taken; `before`: `Memory.asked`."""
+def _goal(observation: Observation, hand: Hand, goals: FloatArray | None) -> FloatArray:
+    """(4,) x, y, z, yaw requested when the observation was taken; `goals`: `Memory.asked`."""
     pose = observation.pose
     assert pose is not None
     here = hand.start
@@ -375,17 +371,13 @@ def _goal(
         here[:3] = pose.reference_position_m
     # Parts that the command node cut off are not known here; an arm at rest shows them.
     at_rest = bool(np.linalg.norm(pose.twist[:3]) < AT_REST_M_S)
-    if before is None:
+    done = observation.executed_steps
+    if goals is None or done is None:
         return here
-    stamp_ns, goals = before
-    # At a speed override steps take longer, see "Speed override" in docs/design.md.
-    passed_s = observation.task.speed * (observation.stamp_wall_ns - stamp_ns) / 1e9
-    steps = passed_s / DT_S
-    done = min(max(steps, 1.0), float(HORIZON))
     row = min(int(done), HORIZON - 1)
     share = done - row if done < HORIZON else 1.0
     asked = goals[row - 1] + share * (goals[row] - goals[row - 1])
-    if at_rest and steps > 1.0 and np.linalg.norm(np.ptp(goals[: row + 1, :3], axis=0)) < 1e-3:
+    if at_rest and done > 1.0 and np.linalg.norm(np.ptp(goals[: row + 1, :3], axis=0)) < 1e-3:
         return np.append(here[:3], asked[3])
     return asked
 

@@ -185,10 +185,14 @@ def test_scripted_asks_for_exactly_the_way_of_its_prompt_however_often_it_is_ask
     seen = looked_at(policy, "scripted")
     seen = replace(seen, task=replace(seen.task, prompt=f"HARD: {prompt}"))
     timeline = GoalTimeline(Goal(Pose(np.zeros(3), np.eye(3)), 0.08), 0)
-    now_ns, done = 10**15, False
+    now_ns, done, standing = 10**15, False, timeline.plan
     for _ in range(300):
         now_ns += round(period_s * 1e9)
-        answer = policy.infer(replace(seen, stamp_wall_ns=now_ns))
+        plan, executed = timeline.plan, None
+        if plan is not standing:
+            steps = plan.elapsed_ns(now_ns) / plan.dt_ns
+            executed = min(max(steps, 1.0), len(plan.goals))
+        answer = policy.infer(replace(seen, stamp_wall_ns=now_ns, executed_steps=executed))
         assert done <= answer.done
         done = answer.done
         goals = [timeline.at(now_ns)]
@@ -204,7 +208,8 @@ def test_scripted_gives_one_step_a_request_and_is_done_with_the_last_one() -> No
     policy = make_policy(find_model("scripted"))
     seen = looked_at(policy, "scripted")
     seen = replace(seen, task=replace(seen.task, prompt="HARD: yaw left x3"))
-    answers = [policy.infer(replace(seen, stamp_wall_ns=k * 10**7)) for k in range(1, 6)]
+    executed = [None, *[1.0] * 4]
+    answers = [policy.infer(replace(seen, executed_steps=steps)) for steps in executed]
     turns = [float(np.array(answer.steps)[0, 5]) for answer in answers]
     assert turns == pytest.approx([0.05, 0.05, 0.05, 0.0, 0.0])
     assert [answer.done for answer in answers] == [False, False, True, True, True]

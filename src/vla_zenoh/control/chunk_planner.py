@@ -261,7 +261,9 @@ class ChunkPlanner:
                 if chunk.record.episode != episode:
                     raise _RejectedError(SUPERSEDED)
                 if plans is None:
-                    plans = [planner.plan(chunk, action, own) for planner, own in parts]
+                    plans = [
+                        planner.plan(chunk, action, own, earliest_ns) for planner, own in parts
+                    ]
                     outcomes += [ChunkOutcome(older, OVERTAKEN) for older in self._queue]
                     self._queue.clear()
                     self._pending = chunk, plans
@@ -277,7 +279,6 @@ class ChunkPlanner:
             self._pending = None
             hits: list[LimitHit] = []
             for (planner, own), plan in zip(parts, plans, strict=True):
-                plan.effective_ns = max(plan.effective_ns, earliest_ns)
                 own.add(plan, now_ns)
                 for hit in plan.unreported_hits():
                     hits.append(hit._replace(where=f"{planner._part} {hit.where}".strip()))
@@ -291,7 +292,11 @@ class ChunkPlanner:
 
     # -- plan ---------------------------------------------------------------------------------
     def plan(
-        self, chunk: Stamped[ActionChunk], action: ActionSpec, timeline: GoalTimeline
+        self,
+        chunk: Stamped[ActionChunk],
+        action: ActionSpec,
+        timeline: GoalTimeline,
+        earliest_ns: int = 0,
     ) -> ChunkPlan:
         """A plan of the part's columns of `chunk` on top of what was asked for at its observation.
 
@@ -305,6 +310,8 @@ class ChunkPlanner:
             count = max(1, int((open_loop_s + ROUNDING) / action.dt_s))
         done = record.done and count == len(record.steps)
         observed_ns = record.observation_stamp_ns
+        published_ns = min(chunk.header.stamp_wall_ns, chunk.received_ns)
+        effective_ns = max(published_ns, observed_ns, earliest_ns)
         previous = timeline.in_force(observed_ns)
         base = previous.goal_at(observed_ns)
         space = self._space(action)
@@ -327,7 +334,7 @@ class ChunkPlanner:
         near = previous.goals[previous.index_at(observed_ns)]
         start_rad = near.joints_rad if base.joints_rad is None else base.joints_rad
         plan = ChunkPlan(
-            max(chunk.header.stamp_wall_ns, observed_ns),
+            effective_ns,
             observed_ns,
             max(int(action.dt_s * 1e9), 1),
             [base] * count,
@@ -347,6 +354,7 @@ class ChunkPlanner:
             computed=0,
             clock=timeline.clock,
             soonest=(action.pace if self._pace == "spec" else self._pace) == "soonest",
+            idle_ns=timeline.idle_ns(observed_ns, effective_ns),
             action=action,
             space=space,
             steps=steps,

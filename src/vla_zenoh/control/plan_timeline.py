@@ -1,13 +1,16 @@
 """Action chunks as plans on a time axis: which goal was in force when.
 
-A chunk whose observation was taken at ``t_o`` asks for waypoints ``W_1 .. W_H``::
+A chunk whose observation was taken at ``t_o`` asks for waypoints ``W_1 .. W_H`` from ``t_1`` on::
+
+    t_1 = t_o + idle(t_o, t_p)     idle: the time until its publication t_p in which no plan had a
+                                   step left
 
     W_0 = G(t_o)                   what was asked for until the observation was taken,
                                    or the measured pose, see `ActionSpec.anchor`
     W_k = W_(k-1) o step_k         k = 1 .. H; or W_0 o step_k, see `ActionSpec.relative_to`
-    in force at t: W_k, k = floor((t - t_o) / dt) + 1, at least 1 and at most H
+    in force at t: W_k, k = floor((t - t_1) / dt) + 1, at least 1 and at most H
 
-    G(t) = W_s, s = (t - t_o) / dt, at least 1 and at most H, between two waypoints interpolated
+    G(t) = W_s, s = (t - t_1) / dt, at least 1 and at most H, between two waypoints interpolated
 
 Where a controller covers only a part of each step, its response is what is interpolated, and its
 rate is part of W and G. Between chunks it stands still, as a simulator does during inference.
@@ -15,8 +18,10 @@ rate is part of W and G. Between chunks it stands still, as a simulator does dur
 ``G`` is the same function of every earlier plan. A plan is in force from the moment its chunk was
 *published*: an observation taken later shows its effect, so the next delta stands on top of it; one
 taken earlier does not, so the next delta replaces it. Nothing is counted twice and nothing is lost,
-whatever the latency. Steps whose time has passed when a chunk arrives are skipped, never replayed:
-waypoints are sums, so skipping them loses no distance.
+whatever the latency. Steps whose time has passed while an earlier plan ran are skipped, never
+replayed: waypoints are sums, so skipping them loses no distance. While no plan runs the arm stands,
+at the start or between chunks that are too short for their latency; none of the next chunk's steps
+passes then, since its goal would run ahead of an arm which cannot be faster than its model asks.
 
 Where plans overlap, the goal that is followed may be a blend of several (`PlanAggregator`); ``G``
 is that of the newest plan in every mode.
@@ -42,7 +47,7 @@ import numpy as np
 from vla_zenoh.control.actions import Response, between
 from vla_zenoh.control.limits import Slowdown, into_workspace, slowest
 from vla_zenoh.kinematics.so3 import Pose, interpolate, mean_pose, orthonormal
-from vla_zenoh.policy.plan_clock import HISTORY_NS, PlanClock
+from vla_zenoh.policy.plan_clock import HISTORY_NS, PlanClock, idle_time
 from vla_zenoh.profile import Composition, Limits
 from vla_zenoh.types import Cause, FloatArray
 
@@ -143,7 +148,7 @@ class Plan:
 
     Args:
         effective_ns: in force from this time on.
-        start_ns: time of the observation, at which the window of the first step begins.
+        start_ns: time of the observation.
         dt_ns: duration of a step.
         goals: one per step.
         cause: the chunk it was made from, None for a hold.
@@ -155,6 +160,8 @@ class Plan:
         done: the policy reports that these steps are the last.
         clock: plan time. `dt_ns` is in plan time, the other times are wall time.
         soonest: the arm moves to each goal as fast as it can, and waits there for the next one.
+        idle_ns: plan time from the observation to the window of the first step, in which no plan
+            ran.
     """
 
     effective_ns: int
@@ -171,6 +178,7 @@ class Plan:
     computed: int = -1
     clock: PlanClock = WALL_CLOCK
     soonest: bool = False
+    idle_ns: int = 0
     _start_ns: int = field(init=False)  # in plan time
 
     def __post_init__(self) -> None:
@@ -180,10 +188,10 @@ class Plan:
 
     def run_on(self, clock: PlanClock) -> None:
         """Run on this clock, which remembers the time of the observation now, and not for long."""
-        self.clock, self._start_ns = clock, clock.at(self.start_ns)
+        self.clock, self._start_ns = clock, clock.at(self.start_ns) + self.idle_ns
 
     def elapsed_ns(self, t_ns: int) -> int:
-        """Plan time from the observation to `t_ns`."""
+        """Plan time from the begin of the first step to `t_ns`."""
         return self.clock.at(t_ns) - self._start_ns
 
     def due_index(self, t_ns: int) -> int:
@@ -217,6 +225,14 @@ class Plan:
     def end_ns(self) -> int:
         """End of the last step, at the present override."""
         return self.clock.wall_at(self._start_ns + len(self.goals) * self.dt_ns)
+
+    @property
+    def run_ns(self) -> tuple[int, int]:
+        """When it comes into force and when its last step ends, in plan time; a hold has none."""
+        begin_ns = self.clock.at(self.effective_ns)
+        if self.cause is None:
+            return begin_ns, begin_ns
+        return begin_ns, self._start_ns + len(self.goals) * self.dt_ns
 
     def left_ns(self, t_ns: int) -> int:
         """Plan time from `t_ns` to the end of the last step."""
@@ -286,6 +302,11 @@ class GoalTimeline:
         """The newest plan that was in force at `t_ns`."""
         in_force = (plan for plan in reversed(self._plans) if plan.effective_ns <= t_ns)
         return next(in_force, self._plans[0])
+
+    def idle_ns(self, begin_ns: int, end_ns: int) -> int:
+        """Plan time between two wall times in which no plan of a chunk ran."""
+        runs = [plan.run_ns for plan in self._plans]
+        return round(idle_time(self.clock.at(begin_ns), self.clock.at(end_ns), runs))
 
     def at(self, t_ns: int) -> Goal:
         """G(t) of the plan that was in force at `t_ns`."""

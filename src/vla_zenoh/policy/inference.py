@@ -17,7 +17,7 @@ import inspect
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import SpecError
 from vla_zenoh.policy.meaning import RotationForm, toward, unturned
-from vla_zenoh.policy.plan_clock import PlanClock
+from vla_zenoh.policy.plan_clock import PlanClock, idle_time
 from vla_zenoh.policy.spec import ActionSpec, ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
@@ -85,6 +85,8 @@ class Observation:
         robot: its name, for a model that serves several and keeps state of each.
         parts: of a robot of several parts, name -> the same with the state of that part, all of one
             time; the observation itself then has no joint, pose and gripper.
+        executed_steps: how many steps of the model's last chunk were executed when it was taken, at
+            least its first one, with parts of a step; None: the arm followed none in this episode.
     """
 
     stamp_wall_ns: int
@@ -101,6 +103,7 @@ class Observation:
     effort_nm: FloatArray | None = None
     history: tuple[Observation, ...] = ()
     parts: Mapping[str, Observation] = field(default_factory=dict)
+    executed_steps: float | None = None
 
     @property
     def prompt(self) -> str:
@@ -251,8 +254,24 @@ class Committed:
         return out
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Followed:
+    """A chunk that the arm follows. `busy_until`: plan time until which it had other steps."""
+
+    episode: int
+    observed_ns: int
+    published_ns: int
+    busy_until: float
+    steps: NDArray[np.float32]
+
+    def begin(self, clock: PlanClock) -> float:
+        """Plan time at which its first step begins."""
+        seen = clock.at(self.observed_ns)
+        return seen + idle_time(seen, clock.at(self.published_ns), [(-math.inf, self.busy_until)])
+
+
 class ChunkPrefix:
-    """Calls a model with the prefix of its next chunk, from its last chunk and its latency.
+    """Calls a model with what was executed of its last chunk, and with the prefix of the next one.
 
     Args:
         max_age_s: `max_observation_age_s` of the profile: after a pause (speed override 0) the
@@ -275,7 +294,9 @@ class ChunkPrefix:
         self._clock: PlanClock | None = None
         self._resumed_ns = 0
         self._latencies_s: deque[float] = deque(maxlen=REMEMBERED_LATENCIES)
-        self._last: tuple[int, int, NDArray[np.float32]] | None = None
+        self._last: _Followed | None = None
+        self._busy_until = -math.inf
+        """Plan time until which the arm has steps to execute of which the worker does not know."""
 
     def set_override(self, override: float, stamp_ns: int) -> None:
         """The speed override, 0 to 1, in force from `stamp_ns` on, wall clock; oldest first."""
@@ -289,7 +310,7 @@ class ChunkPrefix:
     def infer(self, observation: Observation) -> ActionSteps:
         """Infer, with the committed steps if the model takes them."""
         extra: Any = {"committed": self.committed(observation)} if self._takes else {}
-        result = self._policy.infer(observation, **extra)
+        result = self._policy.infer(self.with_progress(observation), **extra)
         return result if isinstance(result, ActionSteps) else ActionSteps(result)
 
     def published(
@@ -308,29 +329,49 @@ class ChunkPrefix:
             published_ns: wall clock.
             obeyed: the arm follows this worker; otherwise nothing is committed.
         """
-        self._latencies_s.append((published_ns - observation.stamp_wall_ns) / 1e9)
-        self._last = (
-            (observation.task.episode, observation.stamp_wall_ns, steps) if obeyed else None
-        )
+        seen_ns, task = observation.stamp_wall_ns, observation.task
+        self._latencies_s.append((published_ns - seen_ns) / 1e9)
+        if not obeyed:
+            self._last = None
+            # How long the chunk of another worker lasts is unknown here.
+            self._busy_until = math.inf if task.active else -math.inf
+            return
+        busy_until = self._busy_until
+        if self._last is not None:
+            busy_until = self._last.begin(self._plan_time(observation))
+            busy_until += len(self._last.steps) * self._action.dt_s * 1e9
+        self._last = _Followed(task.episode, seen_ns, published_ns, busy_until, steps)
+
+    def with_progress(self, observation: Observation) -> Observation:
+        """The observation with `executed_steps`."""
+        return replace(observation, executed_steps=self._executed(observation))
+
+    def _executed(self, observation: Observation) -> float | None:
+        last = self._last
+        if last is None or last.episode != observation.task.episode:
+            return None
+        clock = self._plan_time(observation)
+        passed_ns = clock.at(observation.stamp_wall_ns) - last.begin(clock)
+        # The command node starts the first step at once; see control/plan_timeline.py.
+        return min(max(passed_ns / 1e9 / self._action.dt_s, 1.0), float(len(last.steps)))
+
+    def _plan_time(self, observation: Observation) -> PlanClock:
+        return self._clock or PlanClock(observation.task.speed)
 
     def committed(self, observation: Observation) -> Committed | None:
         """Steps in execution at this observation; None: none."""
-        if self._last is None or self._last[0] != observation.task.episode:
+        last, had = self._last, self._executed(observation)
+        if last is None or had is None:
             return None
-        _, stamp_ns, steps = self._last
-        if (self._resumed_ns - stamp_ns) / 1e9 > self._max_age_s:
+        if (self._resumed_ns - last.observed_ns) / 1e9 > self._max_age_s:
             return None
-        # The command node starts the first step at once; see control/plan_timeline.py.
-        clock = self._clock or PlanClock(observation.task.speed)
-        passed_s = (clock.at(observation.stamp_wall_ns) - clock.at(stamp_ns)) / 1e9
-        had = max(passed_s / self._action.dt_s, 1.0)
         try:
-            left = rest_of(self._action, steps, had)
+            left = rest_of(self._action, last.steps, had)
         except SpecError:  # numbers that are no rotation, which no arm follows
             return None
         if not len(left):
             return None
-        late = clock.override * max(self._latencies_s) / self._action.dt_s
+        late = self._plan_time(observation).override * max(self._latencies_s) / self._action.dt_s
         return Committed(left, min(math.ceil(late - ALIGNED), len(left)))
 
 

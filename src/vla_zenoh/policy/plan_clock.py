@@ -1,14 +1,37 @@
 """Plan time: wall time at the speed override.
 
 The command node counts the steps of a chunk in it, and so does whoever tells what was executed.
+
+The first step of a chunk begins at its observation, later by the time until its publication in
+which no step of an earlier chunk was left (`idle_time`). The arm stood then, and the observation
+shows what it still showed at the publication. So no step of a first chunk, or of one after a pause,
+is skipped because its inference took time.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 HISTORY_NS = 15_000_000_000
 """Observations are rejected long before they are this old."""
 FOREVER_NS = 1 << 62
 """A time that does not come."""
+
+
+def idle_time(begin: float, end: float, runs: Iterable[tuple[float, float]]) -> float:
+    """Time from `begin` to `end` in which no chunk was executed.
+
+    Args:
+        begin: an observation, in plan time.
+        end: the publication of its chunk, in plan time.
+        runs: publication and end of the last step of earlier chunks, oldest first; each is replaced
+            by the next.
+    """
+    idle, replaced = end - begin, end
+    for published, over in reversed([*runs]):
+        idle -= max(min(over, replaced) - max(published, begin), 0.0)
+        replaced = min(replaced, published)
+    return max(idle, 0.0)
 
 
 class PlanClock:

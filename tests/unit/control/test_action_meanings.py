@@ -350,7 +350,8 @@ def test_twenty_steps_of_osc_move_the_arm_as_far_in_any_chunks(
             rig.tick()
         ago_s = (rig.now_ns + rig.period_ns - observed_ns) / 1e9
         rig.send(rows[:steps_a_chunk], observed_ago_s=ago_s)
-        while rig.now_ns < observed_ns + max(steps_a_chunk * 50 * MS, (late + 2) * rig.period_ns):
+        ends_ns = rig.now_ns + steps_a_chunk * 50 * MS
+        while rig.now_ns < ends_ns:
             rig.tick()
     rig.settle()
     assert wanted_m[0] == pytest.approx(0.077, abs=1e-4)

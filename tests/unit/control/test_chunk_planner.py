@@ -178,11 +178,13 @@ def test_chunks_that_come_while_another_is_bounded_lose_no_step() -> None:
     rig.run(0.4)
     asked, up = 0.0, [0.0, 0.0, 0.004, 0.0, 0.0, 0.0, 0.0]
     for _ in range(4):
+        rig.send([up] * 12)
+        rig.run(0.2)
         # Ten steps are due when it arrives; the next one comes before it is in force.
         rig.tick(chunks=[rig.chunk([up] * 12, observed_ago_s=0.2, published_ago_s=0.02)])
         rig.tick(chunks=[rig.chunk([up], observed_ago_s=0.01)])
         rig.run(0.3)
-        asked += 1 + (0.2 + 0.004 - 0.01) / 0.02
+        asked += 1 + 1 + (0.2 + 0.004 - 0.01) / 0.02
     assert rig.refused == {}
     rig.settle(2.0)
     np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.004 * asked], atol=AT_GOAL_M)
@@ -220,9 +222,10 @@ def test_of_a_heap_whose_newest_is_a_mistake_the_one_before_is_carried_out() -> 
 def test_a_chunk_that_is_not_in_force_yet_never_will_be_after_a_stop_or_another_prompt(
     order: str,
 ) -> None:
-    rig = arm_rig()
+    # All of its steps are bounded first.
+    rig = arm_rig(profile(limits={"out_of_bounds": "refuse"}))
     rig.run(0.4)
-    assert rig.send([UP] * 24, observed_ago_s=0.35).accepted is None
+    assert rig.send([UP] * 24).accepted is None
     out = rig.tick("stop") if order == "stop" else rig.put("prompt", "something else")
     assert out.accepted is None
     assert rig.refused == {"superseded": 1}

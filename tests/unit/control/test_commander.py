@@ -234,16 +234,53 @@ def test_a_chunk_published_before_it_was_observed_counts_from_its_observation() 
     np.testing.assert_allclose(rig.moved_m(), [0, 0, 3 * STEP_M], atol=AT_GOAL_M)
 
 
-def test_steps_whose_time_has_passed_are_skipped_and_no_way_is_lost() -> None:
+def test_steps_whose_time_has_passed_while_another_chunk_ran_are_skipped_and_no_way_is_lost() -> (
+    None
+):
     rig = Rig()
     rig.activate()
     rig.run(0.4)
-    out = rig.send([UP] * 8, observed_ago_s=0.35)
+    rig.send([UP] * 8)
+    rig.run(0.346)
+    out = rig.send([UP] * 8, observed_ago_s=0.34)
     assert out.pose is not None
-    np.testing.assert_allclose(out.pose.goal_position_m, START_M + [0, 0, 0.04])
+    # One step of the first chunk and four of the second.
+    np.testing.assert_allclose(out.pose.goal_position_m, START_M + [0, 0, 0.05])
     rig.settle()
-    np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.08], atol=AT_GOAL_M)
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.09], atol=AT_GOAL_M)
     rig.assert_smooth()
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.05, 0.35])
+@pytest.mark.parametrize("earlier", [0, 2])
+def test_an_arm_that_stands_begins_a_late_chunk_at_its_first_step(
+    late_s: float, earlier: int
+) -> None:
+    rig = Rig()
+    rig.activate()
+    if earlier:
+        rig.send([UP] * earlier)
+    rig.run(0.6)
+    out = rig.send([UP] * 8, observed_ago_s=late_s)
+    assert out.pose is not None
+    np.testing.assert_allclose(out.pose.goal_position_m, START_M + [0, 0, 0.01 * (earlier + 1)])
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.01 * (earlier + 8)], atol=AT_GOAL_M)
+    rig.assert_smooth()
+
+
+@pytest.mark.parametrize("published_ago_s", [-10.0, 0.0])
+def test_a_chunk_that_lies_about_its_publication_begins_when_it_arrives(
+    published_ago_s: float,
+) -> None:
+    rig = Rig()
+    rig.activate()
+    rig.run(0.4)
+    rig.send([UP] * 8, observed_ago_s=0.3, published_ago_s=published_ago_s)
+    rig.run(0.25)
+    goal = rig.commander.parts[0].motion.goal
+    assert goal is not None
+    np.testing.assert_allclose(goal.pose.position_m, START_M + [0, 0, 0.03])
 
 
 @pytest.mark.parametrize("period_s", [0.1, 0.2, 0.28, 0.52])

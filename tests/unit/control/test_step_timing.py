@@ -13,6 +13,7 @@ import pytest
 from command_rig import MS, Rig, profile
 
 from vla_zenoh.kinematics.so3 import norm3
+from vla_zenoh.policy.plan_clock import idle_time
 
 RIPPLE = 0.3
 """(max - min) / mean of the commanded speed over the middle of the way; of a model that cannot
@@ -43,7 +44,7 @@ class Worker:
     def __post_init__(self) -> None:
         self._random = random.Random(self.seed)
         self._begun_ns = self._due_ns = self._free_ns = self.rig.now_ns
-        self._last_ns = 0
+        self._last_ns = self._over_ns = 0.0
         self._on_the_way: deque[tuple[int, int, list[list[float]]]] = deque()
 
     @property
@@ -75,7 +76,9 @@ class Worker:
         ways = np.diff([begun, *self.ends]) * STEP_M
         steps = [[0.0, 0.0, way, 0.0, 0.0, 0.0, 0.0] for way in ways]
         takes_s = self.inference_s * (1 + self.jitter * self._random.uniform(-1, 1))
-        self._last_ns, self._free_ns = seen_ns, now_ns + round(takes_s * 1e9)
+        self._free_ns = now_ns + round(takes_s * 1e9)
+        self._last_ns = seen_ns + idle_time(seen_ns, self._free_ns, [(0, self._over_ns)])
+        self._over_ns = self._last_ns + len(steps) * self.dt_s * 1e9 / self.speed
         self._due_ns = max(self._due_ns + round(1e9 / self.rate_hz / self.speed), self._free_ns)
         self._on_the_way.append((self._free_ns, seen_ns, steps))
 

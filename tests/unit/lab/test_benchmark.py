@@ -114,14 +114,6 @@ def test_through_the_command_node_the_same_delay_gives_the_same_end() -> None:
     assert run(conditions).end == run(conditions).end
 
 
-def test_through_the_command_node_the_first_chunk_is_carried_out_from_its_first_step_on() -> None:
-    pytest.importorskip("ruckig")
-    first = 3  # steps of a chunk, before another one can have come
-    at_once, late = (run(EpisodeConditions("command", delay_ms=ms)) for ms in (0.0, 300.0))
-    # Chunks come in another phase of the command node's ticks, 4 ms: less than 5 cm/s in that time.
-    np.testing.assert_allclose(late.actions[:first], at_once.actions[:first], atol=4e-4, rtol=0)
-
-
 def test_recorded_steps_end_in_the_same_state() -> None:
     ended = run()
     again = replay_episode(own_benchmark(), request(), ended.actions)

@@ -19,6 +19,7 @@ from dataset_rig import (
     DT_S,
     HEIGHT,
     HORIZON,
+    LATENCY_MS,
     PROFILE,
     PROMPTS,
     WIDTH,
@@ -76,6 +77,13 @@ def expected_actions(activation: int) -> np.ndarray:
     return np.concatenate([steps_of(activation, chunk)[:USED] for chunk in range(CHUNKS)])
 
 
+def expected_apart_s(used: int, step_s: float) -> np.ndarray:
+    """The arm stood until the first chunk was published, so its steps began then."""
+    apart_s = np.full(used * CHUNKS - 1, step_s)
+    apart_s[used - 1] -= LATENCY_MS / 1e3
+    return apart_s
+
+
 def test_every_activation_is_an_episode_with_the_steps_as_they_were_published(
     run_file: Path,
 ) -> None:
@@ -85,7 +93,7 @@ def test_every_activation_is_an_episode_with_the_steps_as_they_were_published(
         actions = np.array([frame.action for frame in episode.frames])
         np.testing.assert_array_equal(actions, expected_actions(number))
         apart_s = np.diff([frame.stamp_ns for frame in episode.frames]) / 1e9
-        np.testing.assert_allclose(apart_s, DT_S)
+        np.testing.assert_allclose(apart_s, expected_apart_s(USED, DT_S))
 
 
 def test_a_chunk_that_ran_out_is_followed_by_frames_that_stand_still(tmp_path: Path) -> None:
@@ -110,7 +118,7 @@ def test_at_a_lower_speed_override_only_steps_that_the_arm_had_time_for_are_fram
     wanted = np.concatenate([steps_of(0, chunk)[:used] for chunk in range(CHUNKS)])
     np.testing.assert_array_equal([frame.action for frame in episode.frames], wanted)
     apart_s = np.diff([frame.stamp_ns for frame in episode.frames]) / 1e9
-    np.testing.assert_allclose(apart_s, DT_S * 100 / percent)
+    np.testing.assert_allclose(apart_s, expected_apart_s(used, DT_S * 100 / percent))
 
 
 @pytest.mark.parametrize("dt_s", [0.125, 0.4 / 3, 0.5, 0.04])
@@ -156,6 +164,7 @@ def test_states_are_those_of_the_frames_time(dataset: Path) -> None:
     assert states.shape == (40, 7)
     begin_ms = 500 + 5
     seen_ms = begin_ms + np.arange(20) * CHUNK_MS / USED
+    seen_ms[:USED] += LATENCY_MS
     np.testing.assert_allclose(states[:20, 2], seen_ms / 1e4, atol=6e-4)
     np.testing.assert_allclose(states[:, [0, 1, 6]], [[0.4, 0.0, 0.05]] * 40, atol=STATE_ATOL)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from dataset_rig import CHUNKS, HORIZON, spec, steps_of, write_run
+from dataset_rig import CHUNKS, HORIZON, LATENCY_MS, spec, steps_of, write_run
 from pair_recording_rig import (
     BEGIN_MS,
     END_MS,
@@ -101,8 +101,8 @@ def test_actions_and_states_of_each_part_are_in_the_numbers_of_lerobots_robots(
     np.testing.assert_allclose(actions, np.concatenate(wanted), rtol=1e-6)
     states = np.array(table["observation.state"].to_pylist()) * unit
     for number, state in enumerate(states):
-        at_ms = BEGIN_MS + 5 + 100 * number
-        near_ms = (at_ms - 5, at_ms + 5)
+        at_ms = BEGIN_MS + 5 + 100 * number + (LATENCY_MS if number < USED else 0)
+        near_ms = (at_ms // 10 * 10, at_ms // 10 * 10 + 10)
         for part, own in zip(SPEED_M_S, (state[:3], state[3:]), strict=True):
             assert (
                 min(np.abs(own[:2] - joints_rad(part, each)).max() for each in near_ms) < STATE_ATOL

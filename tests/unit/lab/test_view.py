@@ -319,13 +319,13 @@ def test_a_chunk_in_the_middle_of_another_stands_on_what_that_had_asked_for(tmp_
         tmp_path,
         put(KEYS.spec("scripted"), SPEC, 0),
         put(KEYS.command_pose, command(0), 0),
-        chunk(start_ns, 1),  # observed at 100 ms: its step 2 ends at 500 ms
+        chunk(start_ns, 1),  # the first one, so it begins then: its step 2 ends at 550 ms
         put(KEYS.command_pose, command(200 * MS), start_ns, 1),
         chunk(400 * MS + 50 * MS, 2),
     )[1]
     _, ((second, *_),) = shown.values("world/chunk/scripted", "LineStrips3D:strips")
-    # Two steps are asked for by 500 ms; at 400 ms one and a half of them.
-    assert second[2] == pytest.approx(goal_m(200 * MS)[2] - 0.5 * STEP_M, abs=POSITION_TOLERANCE_M)
+    # Two steps are asked for by 550 ms; at 400 ms one and a quarter of them.
+    assert second[2] == pytest.approx(goal_m(200 * MS)[2] - 0.75 * STEP_M, abs=POSITION_TOLERANCE_M)
 
 
 def test_a_ribbon_that_nobody_renews_is_taken_away(tmp_path: Path) -> None:

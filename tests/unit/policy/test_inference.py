@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from vla_zenoh_dataset.episodes import StepClock
+from vla_zenoh_dataset.episodes import StepClock, step_begins
 
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.kinematics.so3 import Pose
@@ -18,7 +18,7 @@ from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.recording.run import RecordedSample
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation
 from vla_zenoh.policy.inference import ChunkPrefix, Committed, rest_of
-from vla_zenoh.types import Header, Task
+from vla_zenoh.types import ActionChunk, Cause, Header, Task
 
 ATOL = 1e-6  # steps travel as float32
 MS = 1_000_000
@@ -55,7 +55,8 @@ def seen(at_ms: float, episode: int = 1) -> Observation:
 def told(at_ms: float, late_ms: float, *, obeyed: bool = True, **more: Any) -> Committed | None:
     model = Model(**more)
     continuation = ChunkPrefix(model)
-    first = seen(0)
+    first, earlier = seen(0), seen(-1)
+    continuation.published(earlier, ramp(), earlier.stamp_wall_ns, obeyed=obeyed)
     published_ns = first.stamp_wall_ns + round(late_ms * MS)
     continuation.published(first, ramp(), published_ns, obeyed=obeyed)
     continuation.infer(seen(at_ms))
@@ -103,7 +104,8 @@ def test_a_model_that_does_not_take_it_is_called_without() -> None:
 
 
 def test_never_more_is_frozen_than_there_is() -> None:
-    committed = told(600, 5000)
+    # It is late by more than the step before it: as much of the time the arm stood.
+    committed = told(600 + 5000 - 799, 5000)
     assert committed is not None
     assert committed.frozen == len(committed.steps) == 2
 
@@ -156,12 +158,24 @@ Overrides = tuple[tuple[float, float], ...]
 """(Time in ms, share) of the speed override, oldest first."""
 
 
-def told_under(overrides: Overrides, at_ms: float, *, max_age_s: float = 60.0) -> Committed | None:
-    """What a model is told at a time of the chunk that it answered to the observation at 0 ms."""
+def told_under(
+    overrides: Overrides,
+    at_ms: float,
+    *,
+    max_age_s: float = 60.0,
+    published_ms: float = 100,
+    stood: bool = False,
+) -> Committed | None:
+    """What a model is told at a time of the chunk that it answered to the observation at 0 ms.
+
+    The arm followed an earlier chunk, unless it `stood`.
+    """
     model = Model()
     prefix = ChunkPrefix(model, max_age_s)
     prefix.set_override(overrides[0][1], seen(overrides[0][0]).stamp_wall_ns)
-    prefix.published(seen(0), ramp(), seen(100).stamp_wall_ns, obeyed=True)
+    if not stood:
+        prefix.published(seen(-1), ramp(), seen(-1).stamp_wall_ns, obeyed=True)
+    prefix.published(seen(0), ramp(), seen(published_ms).stamp_wall_ns, obeyed=True)
     for time_ms, share in overrides[1:]:
         prefix.set_override(share, seen(time_ms).stamp_wall_ns)
     task = replace(seen(at_ms).task, speed_percent=100.0 * overrides[-1][1])
@@ -214,11 +228,14 @@ def test_after_a_pause_what_the_command_node_dropped_is_not_committed() -> None:
         st.tuples(st.integers(1, 400), st.sampled_from((0.0, 0.1, 0.35, 0.5, 1.0))), max_size=5
     ),
     st.sampled_from((0.25, 0.5, 1.0)),
+    st.integers(0, 400),
     st.integers(1, 1500),
+    st.booleans(),
 )
 def test_worker_command_node_and_data_set_count_the_same_steps(
-    changes: list[tuple[int, float]], first: float, at_ms: int
+    changes: list[tuple[int, float]], first: float, published_ms: int, after_ms: int, stood: bool
 ) -> None:
+    at_ms = published_ms + after_ms
     times = np.cumsum([after for after, _ in changes])
     later = [(float(at), share) for at, (_, share) in zip(times, changes, strict=True)]
     overrides = ((-1000.0, first), *(one for one in later if one[0] < at_ms))
@@ -226,17 +243,27 @@ def test_worker_command_node_and_data_set_count_the_same_steps(
     poses = [Pose(np.array([0.001 * (k + 1), 0.0, 0.0]), np.eye(3)) for k in range(8)]
     timeline = GoalTimeline(Goal(poses[0], 0.0), zero_ns - 1000 * MS)
     timeline.clock.set(first, zero_ns - 1000 * MS)
-    timeline.add(Plan(zero_ns, zero_ns, 100 * MS, [Goal(pose, 0.0) for pose in poses]), zero_ns)
+    goals, published_ns = [Goal(pose, 0.0) for pose in poses], zero_ns + published_ms * MS
+    cause = Cause("m", 1, *(zero_ns,) * 6)
+    followed = [] if stood else [published(seen(-1), -1)]
+    if not stood:
+        timeline.add(Plan(zero_ns - MS, zero_ns - MS, 100 * MS, goals, cause), zero_ns - MS)
+    followed.append(published(seen(0), published_ms))
     task = replace(seen(0).task, speed_percent=100.0 * first)
     tasks = [recorded(task, -1000.0)]
     for time_ms, share in overrides[1:]:
         timeline.clock.set(share, zero_ns + round(time_ms * MS))
         tasks.append(recorded(replace(task, speed_percent=100.0 * share), time_ms))
+    plan = Plan(published_ns, zero_ns, 100 * MS, goals, cause)
+    plan.idle_ns = timeline.idle_ns(zero_ns, published_ns)
+    timeline.add(plan, published_ns)
     end_ns = zero_ns + at_ms * MS
     executed = timeline.plan.steps_until(end_ns)
-    exported = StepClock(tasks, zero_ns, end_ns, 0.1).steps(end_ns)
+    begin_ns = step_begins(tasks, followed, {"": 0.1})[followed[-1].header]
+    exported = StepClock(tasks, zero_ns, end_ns, 0.1)
+    exported = exported.steps(end_ns) - exported.steps(begin_ns)
     assert min(max(exported, 1.0), 8.0) == pytest.approx(executed, abs=1e-4)
-    committed = told_under(overrides, at_ms)
+    committed = told_under(overrides, at_ms, published_ms=published_ms, stood=stood)
     if committed is None:
         assert executed > 7.0 - 1e-3
         return
@@ -244,6 +271,13 @@ def test_worker_command_node_and_data_set_count_the_same_steps(
     assert abs(len(left) - len(committed.steps)) <= 1
     shared = min(len(left), len(committed.steps))
     np.testing.assert_allclose(committed.steps[:shared, 0], left[:shared, 0], atol=2e-6)
+
+
+def published(observation: Observation, at_ms: float) -> RecordedSample:
+    """A recorded chunk that answers it."""
+    seen_ns, at_ns = observation.stamp_wall_ns, seen(at_ms).stamp_wall_ns
+    chunk = ActionChunk("m", "", 1, seen_ns, 1, at_ns, ramp(), seen_ns, seen_ns, at_ns)
+    return RecordedSample(Header(at_ns, 1, "worker-m#1"), chunk, at_ns, "delta/m")
 
 
 def recorded(task: Task, time_ms: float) -> RecordedSample:

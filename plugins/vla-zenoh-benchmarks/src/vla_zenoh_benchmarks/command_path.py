@@ -18,6 +18,7 @@ from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
 from vla_zenoh.types.records import JointReference, PoseReference
 from vla_zenoh_benchmarks.episode import EpisodeClock, EpisodeConditions
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 WARM_UP_S, ACTIVATE_PATIENCE_S, POLL_S = 0.3, 3.0, 0.02
 JOINTS = 7
@@ -44,8 +45,9 @@ def run_through_command_node(clock: EpisodeClock, conditions: EpisodeConditions)
     )
     world = _EnvironmentWorld(clock)
     policy = _AskedPolicy(clock, world)
-    loop = Lockstep(profile, world, policy)  # pyright: ignore[reportArgumentType]
-    world.loop, policy.delay_s = loop, (conditions.delay_ms or 0.0) / 1e3
+    delays = Delays((conditions.delay_ms or 0.0) / 1e3)
+    loop = Lockstep(profile, world, policy, delays=delays)  # pyright: ignore[reportArgumentType]
+    world.loop, policy.delay_ns = loop, round(delays.inference_s * 1e9)
     taken = conditions.replan or clock.spec.action.horizon
     loop.put("rate", min(100.0, 1.0 / (taken * clock.spec.action.dt_s)))
     loop.put("prompt", clock.request.task.prompt or "go")
@@ -64,7 +66,7 @@ class _AskedPolicy:
 
     def __init__(self, clock: EpisodeClock, world: _EnvironmentWorld) -> None:
         self._clock, self._world = clock, world
-        self.delay_s = 0.0
+        self.delay_ns = 0
         self.spec = ModelSpec(
             name=clock.spec.name,
             observation=ObservationSpec(state=("pose",), prompt=False),
@@ -75,10 +77,7 @@ class _AskedPolicy:
         if not observation.task.active or self._clock.over:
             return ActionSteps(np.zeros((1, self.spec.action.dimension)))
         steps = self._clock.ask()
-        # Until its first chunk comes the clock stands, so that chunk is not late.
-        for worker in self._world.loop.workers.values():
-            worker.inference_s = self.delay_s if self._world.begun else 0.0
-        self._world.begin()
+        self._world.begin(self.delay_ns)
         return ActionSteps(steps)
 
 
@@ -102,13 +101,9 @@ class _EnvironmentWorld:
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
         return np.full(JOINTS, -3.0), np.full(JOINTS, 3.0)
 
-    @property
-    def begun(self) -> bool:
-        return self._next_ns is not None
-
-    def begin(self) -> None:
+    def begin(self, delay_ns: int) -> None:
         if self._next_ns is None:
-            self._next_ns = self.loop.now_ns + self._step_ns
+            self._next_ns = self.loop.now_ns + delay_ns + self._step_ns
 
     def tick(self, reference: PoseReference | JointReference) -> None:
         if self._next_ns is None or self.loop.now_ns < self._next_ns or self._clock.over:

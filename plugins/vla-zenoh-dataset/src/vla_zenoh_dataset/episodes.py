@@ -12,7 +12,7 @@ in the numbers of the model's spec (`vla_zenoh_dataset.corrections`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -23,7 +23,9 @@ from vla_zenoh.control.actions import as_deltas
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.recording.run import RecordedSample, Run, Span, is_within, newest
 from vla_zenoh.policy import ActionSpec, ModelSpec, standing_step
+from vla_zenoh.policy.plan_clock import idle_time
 from vla_zenoh.policy.spec import PERSON
+from vla_zenoh.types import Header
 from vla_zenoh_dataset.corrections import commanded_motion
 from vla_zenoh_dataset.label import EpisodeLabel
 
@@ -168,9 +170,10 @@ def _episode(
     mixed = any(worker != whose for _, _, worker in led)
     motion = commanded_motion(run, spec.action) if mixed else None
     parts = [(span, _within(span, own)) for span in led]
-    begins = [
-        chunks[0].record.observation_stamp_ns if chunks else span[0] for span, chunks in parts
-    ]
+    followed = [chunk for span in led for chunk in _within(span, carried_out)]
+    dt_s = {key: each.action.dt_s for key, each in run.specs.items()}
+    begun = step_begins(run.tasks, followed, dt_s)
+    begins = [begun[chunks[0].header] if chunks else span[0] for span, chunks in parts]
     ends = [*begins[1:], led[-1][1]]
     frames: list[EpisodeFrame] = []
     clock = StepClock(run.tasks, begins[0], ends[-1], spec.action.dt_s)
@@ -178,7 +181,7 @@ def _episode(
         person = span[2] in people
         if chunks:
             last = span is led[-1]
-            timed = (chunks, end_ns, clock)
+            timed = ([(chunk, begun[chunk.header]) for chunk in chunks], end_ns, clock)
             frames += _frames(run, spec.action, timed, person=person, to_the_end=not last)
         elif motion is not None:
             stamps = [clock.when_ns(at) for at in range(len(frames), clock.count(end_ns) + 1)]
@@ -292,23 +295,46 @@ class StepClock:
         return self._begin_ns + round(np.interp(steps, self._steps, self._passed_s) * 1e9)
 
 
+def step_begins(
+    tasks: Sequence[RecordedSample], followed: Sequence[RecordedSample], dt_s: Mapping[str, float]
+) -> dict[Header, int]:
+    """When the first step of each chunk began, wall clock, see `vla_zenoh.policy.plan_clock`.
+
+    Args:
+        tasks: of the run, oldest first.
+        followed: chunks that the arm followed, in order.
+        dt_s: duration of a step by the hash of its spec.
+    """
+    begins: dict[Header, int] = {}
+    runs: list[tuple[float, float]] = []
+    if followed:
+        since_ns = followed[0].record.observation_stamp_ns
+        clock = StepClock(tasks, since_ns, followed[-1].header.stamp_wall_ns, 1.0)
+    for chunk in followed:
+        record, published_ns = chunk.record, chunk.header.stamp_wall_ns
+        seen, published = clock.steps(record.observation_stamp_ns), clock.steps(published_ns)
+        begin = seen + idle_time(seen, published, runs)
+        runs = [*runs[-1:], (published, begin + len(record.steps) * dt_s[record.spec_hash])]
+        begins[chunk.header] = clock.when_ns(begin)
+    return begins
+
+
 def _frames(
     run: Run,
     spec: ActionSpec,
-    timed: tuple[list[RecordedSample], int, StepClock],
+    timed: tuple[list[tuple[RecordedSample, int]], int, StepClock],
     *,
     person: bool = False,
     to_the_end: bool = False,
 ) -> list[EpisodeFrame]:
-    """Frames of chunks until a time; the last chunk does not go beyond its steps."""
+    """Frames of chunks, each from its begin, until a time; the last one not beyond its steps."""
     chunks, until_ns, clock = timed
-    begins = [chunk.record.observation_stamp_ns for chunk in chunks]
-    ends = [*begins[1:], until_ns]
+    ends = [*(begin_ns for _, begin_ns in chunks[1:]), until_ns]
     out: list[EpisodeFrame] = []
-    for chunk, begin_ns, end_ns in zip(chunks, begins, ends, strict=True):
+    for (chunk, begin_ns), end_ns in zip(chunks, ends, strict=True):
         steps = chunk.record.steps
         count = clock.count(end_ns) - clock.count(begin_ns)
-        if chunk is chunks[-1] and not to_the_end:
+        if chunk is chunks[-1][0] and not to_the_end:
             count = min(count, len(steps))
         rest = standing_step(spec, steps[-1])
         for index in range(count):

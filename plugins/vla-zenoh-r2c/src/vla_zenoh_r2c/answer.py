@@ -17,6 +17,7 @@ from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.kinematics.kinematics import InverseKinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
+from vla_zenoh.policy.inference import ChunkPrefix
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState, Task
@@ -78,10 +79,12 @@ class Answers:
         self._velocity_rad_s = np.minimum(np.broadcast_to(velocity, own.shape), own)
         self._target: tuple[FloatArray, float] | None = None
         self._episode = 0
+        self._followed = ChunkPrefix(policy)
 
     def reset(self) -> None:
         """Begin an episode."""
         self._target, self._episode = None, self._episode + 1
+        self._followed = ChunkPrefix(self._policy)
         (reset_of(self._policy) or (lambda: None))()
 
     def answer(self, seen: Seen, stamp_ms: int) -> Steps:
@@ -94,10 +97,11 @@ class Answers:
         numbers = self._numbers.ordered(seen.names, seen.position)
         joints_rad, width_m = self._numbers.ours(numbers)
         observation = self._observe(seen, joints_rad, float(width_m))
-        result: Any = self._policy.infer(observation)
+        result: Any = self._policy.infer(self._followed.with_progress(observation))
         steps = check_steps(
             self._policy.spec.action, result.steps if isinstance(result, ActionSteps) else result
         )
+        self._followed.published(observation, steps, observation.stamp_wall_ns, obeyed=True)
         start_rad, start_m = self._start(joints_rad, float(width_m))
         ends_rad, widths_m = self._ends(steps, start_rad, start_m)
         rows_rad, rows_m = self._resampled(start_rad, start_m, ends_rad, widths_m)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from vla_zenoh_policy_servers.state_vector import (
 
 from vla_zenoh.errors import PeerError, RecordError, SpecError
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, check_steps, reset_of
-from vla_zenoh.policy.inference import Committed
+from vla_zenoh.policy.inference import ChunkPrefix, Committed
 from vla_zenoh.policy.meaning import IDENTITY
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
@@ -28,7 +28,7 @@ ROUNDING = 0.01
 _OF_PART = {"pose": "position+quat_xyzw", "gripper": "gripper_m", "joint": "joint"}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ServedPolicy:
     """What a model can be asked, and under which names.
 
@@ -42,6 +42,10 @@ class ServedPolicy:
     fields: Mapping[str, FieldSource]
     joints: tuple[str, ...]
     states: Mapping[str, StateNumbers]
+    _followed: ChunkPrefix = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._followed = ChunkPrefix(self.policy)
 
     @property
     def spec(self) -> ModelSpec:
@@ -55,14 +59,17 @@ class ServedPolicy:
 
     def reset(self) -> None:
         """Begin an episode."""
+        self._followed = ChunkPrefix(self.policy)
         (reset_of(self.policy) or (lambda: None))()
 
     def infer(self, observation: Observation, committed: Committed | None) -> NDArray[np.float32]:
-        """(H, D) the model's actions, checked."""
+        """(H, D) the model's actions, checked; whoever asks is taken to execute them at once."""
         extra: dict[str, Any] = {"committed": committed} if self.takes_committed else {}
-        result: Any = self.policy.infer(observation, **extra)
+        result: Any = self.policy.infer(self._followed.with_progress(observation), **extra)
         steps = result.steps if isinstance(result, ActionSteps) else result
-        return check_steps(self.spec.action, steps)
+        checked = check_steps(self.spec.action, steps)
+        self._followed.published(observation, checked, observation.stamp_wall_ns, obeyed=True)
+        return checked
 
     def described(self) -> dict[str, str]:
         """Name -> its content, as text."""

@@ -243,7 +243,8 @@ class WorkerNode:
         extra: dict[str, Any] = {}
         if getattr(self.policy, "takes_committed", False):
             extra["committed"] = [robot.prefix.committed(seen) for robot, seen, _ in ready]
-        found = list(self._infer_batch([observation for _, observation, _ in ready], **extra))
+        seen = [robot.prefix.with_progress(observation) for robot, observation, _ in ready]
+        found = list(self._infer_batch(seen, **extra))
         if len(found) != len(ready):
             raise SpecError(f"infer_batch gave {len(found)} answers to {len(ready)} observations")
         return [one if isinstance(one, ActionSteps) else ActionSteps(one) for one in found]

@@ -93,11 +93,7 @@ class LockstepTrace:
 
 
 class LockstepWorker:
-    """Worker in lockstep: one inference at a time, at the task's rate.
-
-    Attributes:
-        inference_s: what the inference that goes on takes, from observation to chunk.
-    """
+    """Worker in lockstep: one inference at a time, at the task's rate."""
 
     def __init__(
         self, profile: Profile, name: str, policy: Policy, delays: Delays, jitter: random.Random
@@ -108,8 +104,7 @@ class LockstepWorker:
         self.task: Task | None = None
         self._patience_s = profile.timing.max_observation_age_s
         self._continuation = ChunkPrefix(policy, self._patience_s)
-        self.inference_s = delays.inference_s
-        self._share, self._jitter = delays.jitter, jitter
+        self._delays, self._jitter = delays, jitter
         self._streams = Streams.of(self.spec.observation, self.spec.parts)
         self._frozen = FrozenImages.of(profile.cameras)
         self.complaint = ""
@@ -171,8 +166,8 @@ class LockstepWorker:
             return None
         answer = self._continuation.infer(observation)
         steps = check_steps(self.spec.action, answer.steps)
-        share = 1.0 + self._share * self._jitter.uniform(-1.0, 1.0)
-        duration_ns = round(self.inference_s * share * 1e9)
+        share = 1.0 + self._delays.jitter * self._jitter.uniform(-1.0, 1.0)
+        duration_ns = round(self._delays.inference_s * share * 1e9)
         # One inference at a time; missed periods are not made up for.
         period_ns = round(1e9 / self.task.requested_hz)
         self._due_ns = max(self._due_ns + period_ns, now_ns + duration_ns)
