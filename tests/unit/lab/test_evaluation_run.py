@@ -34,6 +34,7 @@ from vla_zenoh.program.main import app
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
+    Event,
     GripperState,
     Header,
     Image,
@@ -108,6 +109,10 @@ def commands() -> Iterable[Sample]:
         command = PoseCommand(position, QUAT, twist, acceleration, goal, QUAT, "active", of)
         sample = put(KEYS.command_pose, command, index, index // TICK_NS)
         yield Sample(*_heard(sample, HEARD_MS))
+
+
+def heard_at(sample: Sample) -> int:
+    return sample.received_ns
 
 
 def _heard(sample: Sample, later_ms: int) -> tuple[Any, ...]:
@@ -208,6 +213,54 @@ def test_chunks_that_were_executed_without_the_motion_asked_for_are_named(
     assert "reached 0.0000 m: its chunks were executed, and the arm did not do it" in problems
     whole = evaluate_loaded(load_run(recording))
     assert "began after" not in " ".join(whole.problems)
+
+
+def test_limits_that_kept_the_arm_from_what_was_asked_are_named_with_their_place(
+    tmp_path: Path,
+) -> None:
+    path, since_ns = tmp_path / "held.mcap", ZERO_NS + SECONDS * 500_000_000
+    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    held = Event("warning", "limit", "keep_out", "shortened at link_6 and shelf", 0.01, 0.02)
+    acted = [put(KEYS.event("command"), held, index * CHUNK_NS, index) for index in range(12)]
+    slower = Event("info", "limit", "joint_velocity", "slower at joint2", 1.0, 2.0)
+    acted.append(put(KEYS.event("command"), slower, 12 * CHUNK_NS, 12))
+    for sample in sorted([*chunks(), *commands(), *states(), *others(), *acted], key=heard_at):
+        if sample.received_ns > since_ns or sample.key != KEYS.state_pose:
+            out.write(sample)
+    out.finish({"dropped": {}})
+    run = evaluate_loaded(load_run(path))
+    (short,) = [each for each in run.problems if "reached" in each]
+    assert "limits acted: keep_out shortened at link_6 and shelf (12 times)" in short
+    assert "joint2" not in short
+
+
+def test_motion_of_a_worker_that_reads_no_prompt_is_no_answer_to_the_prompt(
+    tmp_path: Path,
+) -> None:
+    """Halfway the arm obeys a primitive, which goes somewhere else; the prompt stays as it is."""
+    deaf = SPEC.model_copy(
+        update={"name": "home", "observation": ObservationSpec(cameras=(), prompt=False)}
+    )
+    path = tmp_path / "both.mcap"
+    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    samples = [put(KEYS.spec("home"), deaf, 0, 0)]
+    for sample in (*chunks(), *commands(), *states(), *others()):
+        late = sample.stamp_ns >= ZERO_NS + SECONDS * 500_000_000
+        if late and sample.key == KEYS.task:
+            task = replace(records.decode(Task, sample.payload), worker="home")
+            sample = replace(sample, payload=records.encode(task))
+        elif late and sample.key == KEYS.delta("scripted"):
+            chunk = records.decode(ActionChunk, sample.payload)
+            chunk = replace(chunk, worker="home", spec_hash=deaf.hash)
+            sample = replace(sample, key=KEYS.delta("home"), payload=records.encode(chunk))
+        samples.append(sample)
+    for sample in sorted(samples, key=heard_at):
+        out.write(sample)
+    out.finish({"dropped": {}})
+    run = evaluate_loaded(load_run(path))
+    assert [each.prompt for each in run.segments] == ["HARD: go up", "(home)"]
+    assert [bool(each.asked) for each in run.segments] == [True, False]
+    assert run.prompts == ["HARD: go up"]
 
 
 def test_seams_tell_how_far_the_goal_went(recording: Path) -> None:
@@ -424,6 +477,15 @@ def test_nothing_to_evaluate_is_an_error(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["eval", str(tmp_path)])
     assert done.exit_code == 1
     assert "holds no recording" in " ".join(done.stderr.split())  # it is wrapped
+
+
+def test_nothing_is_written_where_nothing_could_be_evaluated(tmp_path: Path) -> None:
+    (tmp_path / "run.part.mcap").write_bytes(b"")
+    page = tmp_path / "run.html"
+    done = CliRunner().invoke(app, ["eval", str(tmp_path / "run.mcap"), "-o", str(page)])
+    assert done.exit_code == 1
+    assert "run.part.mcap is being written still" in " ".join(done.stderr.split())
+    assert not page.exists()
 
 
 def test_other_files_in_a_folder_are_passed_over(recording: Path) -> None:

@@ -11,6 +11,7 @@ from rich.table import Table
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, fail, new_table
 from vla_zenoh.errors import ResourceError
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import ActionChunk
@@ -164,6 +165,8 @@ def _compare_workers(file: Path, a: str, b: str, tolerance_s: float, as_json: bo
             f"no chunks of {a} and {b} in {file} form a pair: {found.only_a} of {a}, "
             f"{found.only_b} of {b}"
         )
+    if found.unreadable == found.pairs:
+        fail(f"none of the {found.pairs} pairs can be compared: {found.why}")
 
 
 def _compare(path: Path, a: str, b: str, tolerance_s: float) -> Disagreement:
@@ -185,15 +188,18 @@ def _compare(path: Path, a: str, b: str, tolerance_s: float) -> Disagreement:
         if worker not in specs:
             there = sorted({entry.record.worker for entry in run.chunks})
             fail(f"{path} has no chunks of {worker!r}; it has: {', '.join(there) or 'none'}")
-    grips = any(spec.action.gripper != "none" for spec in specs.values())
+    actions = [spec.action for spec in specs.values()]
+    grips = any(action.gripper != "none" for action in actions)
+    arm = make_kinematics(run.profile) if any(each.space == "joint" for each in actions) else None
     return disagreement(
         chunks[a],
         chunks[b],
         specs[a].action,
         specs[b].action,
-        lambda stamp_ns: arm_state(run, stamp_ns),
+        lambda stamp_ns: arm_state(run, stamp_ns, arm),
         max_width_m=run.profile.robot.max_width_m if grips else 0.0,
         tolerance_s=tolerance_s,
+        arm=arm,
     )
 
 

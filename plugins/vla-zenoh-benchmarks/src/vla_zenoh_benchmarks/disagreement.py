@@ -42,8 +42,8 @@ class ArmState(NamedTuple):
     joints_rad: FloatArray | None = None
 
 
-def arm_state(run: Run, stamp_ns: int) -> ArmState:
-    """The measured pose and width of a recording nearest to `stamp_ns`.
+def arm_state(run: Run, stamp_ns: int, arm: Kinematics | None = None) -> ArmState:
+    """The measured pose and width of a recording nearest to `stamp_ns`, with `arm` its joints.
 
     Raises:
         RecordError: no pose or no gripper state was recorded.
@@ -53,7 +53,9 @@ def arm_state(run: Run, stamp_ns: int) -> ArmState:
         raise RecordError(
             "the pose of the arm is unknown: no state/pose or no state/gripper was recorded"
         )
-    return ArmState(pose_of(pose.record), gripper.record.opening_m)
+    joint = None if arm is None else nearest(run.joints, stamp_ns)
+    joints_rad = None if arm is None or joint is None else arm.joints_of(joint.record)
+    return ArmState(pose_of(pose.record), gripper.record.opening_m, joints_rad)
 
 
 class RequestedPath(NamedTuple):
@@ -90,7 +92,8 @@ class Disagreement:
         pairs: chunks of both whose observations are near in time.
         only_a: chunks of A without a partner.
         only_b: chunks of B without a partner.
-        unreadable: pairs with a step that does not fit its spec.
+        unreadable: pairs that cannot be compared.
+        why: the reason of the last of these.
         after_s: mean time ahead at which the paths are compared.
         mean: (6,) mean of the absolute difference along `AXES`, m and rad.
         p95: (6,) its 95th percentile.
@@ -103,6 +106,7 @@ class Disagreement:
     only_a: int
     only_b: int
     unreadable: int = 0
+    why: str = ""
     apart_s: float = 0.0
     after_s: float = 0.0
     mean: FloatArray | None = None
@@ -138,7 +142,7 @@ def requested_path(
     if spec.space != "joint":
         poses = [start.pose, *chunk_poses(spec, steps, start.pose)]
     elif arm is None or start.joints_rad is None:
-        raise RecordError("actions in joints are no poses, which are what is compared")
+        raise RecordError("where the joints were is not in the recording (state/joint)")
     else:
         poses = _poses_of_joints(spec, steps, start.joints_rad, arm)
     widths_m = [start.width_m]
@@ -168,24 +172,25 @@ def disagreement(
     *,
     max_width_m: float,
     tolerance_s: float = DEFAULT_TOLERANCE_S,
+    arm: Kinematics | None = None,
 ) -> Disagreement:
     """Difference between workers A and B. `standing_at`: state of the arm at a wall time (ns)."""
     pairs = paired(a, b, round(tolerance_s * 1e9))
     rows: list[Difference] = []
-    unreadable = 0
+    unreadable, why = 0, ""
     for one, other in pairs:
         start = standing_at(one.observation_stamp_ns)
         try:
             rows.append(
                 difference(
-                    requested_path(spec_a, one.steps, start, max_width_m),
-                    requested_path(spec_b, other.steps, start, max_width_m),
+                    requested_path(spec_a, one.steps, start, max_width_m, arm),
+                    requested_path(spec_b, other.steps, start, max_width_m, arm),
                     max_width_m,
                 )
             )
-        except RecordError:
-            unreadable += 1
-    counts = (len(pairs), len(a) - len(pairs), len(b) - len(pairs), unreadable)
+        except RecordError as error:
+            unreadable, why = unreadable + 1, str(error)
+    counts = (len(pairs), len(a) - len(pairs), len(b) - len(pairs), unreadable, why)
     if not rows:
         return Disagreement(*counts)
     apart_s = [abs(p.observation_stamp_ns - q.observation_stamp_ns) / 1e9 for p, q in pairs]

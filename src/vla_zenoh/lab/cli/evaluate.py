@@ -73,10 +73,10 @@ def evaluation(
                 warn(f"{run.name}: {problem}")
         for why in faults.values():
             errors().print(f"not evaluated: {why}", style="red")
+        if not runs:
+            fail("nothing could be evaluated")
         for kind, part in zip(kinds, parts, strict=True):
             part.write_text(_text(kind, runs, faults), "utf-8")
-    if not runs:
-        fail("nothing could be evaluated")
 
 
 def _kind(path: Path) -> str:

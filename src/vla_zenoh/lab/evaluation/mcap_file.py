@@ -94,7 +94,7 @@ def verdicts(run: Run) -> list[TaskVerdict]:
 
 FILM, MAX_FILM_S = Film(height_px=270, rate_hz=10, quality=30), 180.0
 """The film of a page, and how long a run may be for one."""
-SHOWN_LOST = 5
+SHOWN_LOST, SHOWN_LIMITS = 5, 3
 GAP_S = 0.05
 """A longer gap in a stream is an interruption; nothing is derived across it."""
 PERIOD_QUANTILE = 0.05
@@ -347,8 +347,11 @@ def _segments(
     """A segment for each prompt in force while the arm was active."""
     zero_ns = run.began_ns
     steps = {(e.record.worker, e.header.seq): len(e.record.steps) for e in run.chunks}
-    for since_ns, end_ns, prompt in run.prompt_intervals():
-        out.prompts.append(prompt)
+    for since_ns, end_ns, worker, prompt in run.prompt_intervals():
+        if run.reads_prompts(worker):
+            out.prompts.append(prompt)
+        else:
+            prompt = f"({worker})"
         since_s, until_s = (since_ns - zero_ns) / 1e9, (end_ns - zero_ns) / 1e9
         out.marks.append((since_s, prompt))
         part = measured.part(since_s, until_s)
@@ -366,5 +369,17 @@ def _segments(
                 part.position_m,
                 part.quat_xyzw,
                 out.width_m[low:high],
+                _acted(run.events, since_ns, end_ns),
             )
         )
+
+
+def _acted(events: Iterable[RecordedSample], since_ns: int, end_ns: int) -> tuple[str, ...]:
+    """Limits that shortened the motion meanwhile, the most frequent first."""
+    found = Counter(
+        f"{event.record.what} {event.record.why}"
+        for event in events
+        if since_ns <= event.header.stamp_wall_ns < end_ns
+        and (event.record.kind, event.record.level) == ("limit", "warning")
+    )
+    return tuple(f"{text} ({count} times)" for text, count in found.most_common(SHOWN_LIMITS))

@@ -50,6 +50,7 @@ class PromptSegment:
         drift_m: largest distance from the requested line; from the start without one.
         drift_rad: largest rotation off the requested axis.
         width_m: first and last opening of the gripper, where known.
+        limits: that shortened it, each with its place and how often.
     """
 
     prompt: str
@@ -66,6 +67,7 @@ class PromptSegment:
     drift_m: float | None
     drift_rad: float | None
     width_m: tuple[float, float] | None
+    limits: tuple[str, ...] = ()
 
     @property
     def asked(self) -> float | None:
@@ -92,9 +94,12 @@ class PromptSegment:
         unit, least = ("rad", SHORT_RAD) if self.asked_rad else ("m", SHORT_M)
         if abs(self.asked - self.along) <= max(least, SHORT_SHARE * self.asked):
             return ""
+        why = "its chunks were executed, and the arm did not do it"
+        if self.limits:
+            why = f"limits acted: {'; '.join(self.limits)}"
         return (
             f"prompt {self.prompt!r}: asked {self.asked:.4f} {unit}, reached {self.along:.4f} "
-            f"{unit}: its chunks were executed, and the arm did not do it"
+            f"{unit}: {why}"
         )
 
 

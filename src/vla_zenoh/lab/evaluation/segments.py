@@ -75,6 +75,7 @@ def segment(
     position_m: FloatArray,
     quat_xyzw: FloatArray,
     width_m: FloatArray,
+    limits: tuple[str, ...] = (),
 ) -> PromptSegment:
     """The segment of one prompt.
 
@@ -83,6 +84,7 @@ def segment(
         position_m: (n, 3), may hold NaN.
         quat_xyzw: (n, 4), may hold NaN.
         width_m: (m,) gripper opening, may hold NaN.
+        limits: that acted.
     """
     moved, turned = known(position_m), rotvecs(known(quat_xyzw))
     moved = moved - moved[:1]
@@ -104,6 +106,7 @@ def segment(
         tuple(turned[-1].tolist()) if len(turned) else (),
         *(way[0], turn[0], way[1], turn[1], way[2], turn[2]),
         (float(widths[0]), float(widths[-1])) if len(widths) else None,
+        limits,
     )
 
 

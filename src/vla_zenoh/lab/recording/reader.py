@@ -382,7 +382,9 @@ def open_recording(path: Path) -> Recording:
                         raise RecordingError(f"{path} does not say of which robot it is")
                     return Recording(path, about, profile_yaml)
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+        unfinished = path.with_suffix(f".part{path.suffix}")
+        hint = f"; {unfinished.name} is being written still" if unfinished.exists() else ""
+        raise RecordingError(f"{path} cannot be read: {error.strerror}{hint}") from error
     if problems and not topics:
         raise RecordingError(f"{path} is {problems[0]}, before anything of the run")
     names = ", ".join(list(topics)[:SHOWN_TOPICS]) + (" ..." if len(topics) > SHOWN_TOPICS else "")

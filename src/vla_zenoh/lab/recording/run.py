@@ -60,7 +60,7 @@ class RecordedImage(NamedTuple):
 
 
 Span = tuple[int, int, str]
-"""Since and until when, wall ns, the arm obeyed one worker, or one prompt was in force."""
+"""Since and until when, wall ns, the arm obeyed one worker."""
 
 
 @dataclass(slots=True)
@@ -168,22 +168,33 @@ class Run:
     # -- intervals, by the stamps of the writers: a replayed run is divided as the original is ----
     def activations(self) -> list[Span]:
         """Each interval in which the arm obeyed one worker."""
-        return self._spans("worker")
+        return [
+            (since_ns, until_ns, worker) for since_ns, until_ns, (worker,) in self._spans("worker")
+        ]
 
-    def prompt_intervals(self) -> list[Span]:
-        """Each interval with one prompt in force while the arm was active."""
-        return self._spans("prompt")
+    def prompt_intervals(self) -> list[tuple[int, int, str, str]]:
+        """Each interval with one worker obeyed and one prompt in force, after its two ends."""
+        return [
+            (*ends, worker, prompt) for *ends, (worker, prompt) in self._spans("worker", "prompt")
+        ]
+
+    def reads_prompts(self, worker: str) -> bool:
+        """Whether a worker is a model that is given prompts, by the specs of its chunks."""
+        hashes = {chunk.record.spec_hash for chunk in self.chunks if chunk.record.worker == worker}
+        specs = [self.specs[each] for each in hashes if each in self.specs]
+        return not specs or any(spec.observation.prompt for spec in specs)
 
     def obeyed_chunks(self) -> list[RecordedSample]:
         """Chunks of the obeyed worker while the arm was active: the requests."""
         spans = self.activations()
         return [chunk for chunk in self.chunks if any(is_within(chunk, span) for span in spans)]
 
-    def _spans(self, name: str) -> list[Span]:
-        out: list[Span] = []
+    def _spans(self, *names: str) -> list[tuple[int, int, tuple[str, ...]]]:
+        out: list[tuple[int, int, tuple[str, ...]]] = []
         since_ns, now = 0, None
         for entry in self.tasks:
-            value = getattr(entry.record, name) if entry.record.active else None
+            task = entry.record
+            value = tuple(getattr(task, name) for name in names) if task.active else None
             if value != now:
                 stamp_ns = entry.header.stamp_wall_ns
                 if now is not None:
