@@ -28,7 +28,7 @@ class Feel:
         action = ActionSpec(horizon=1, dt_s=0.1, rotation="rpy", gripper="none")
         self.spec = ModelSpec(name="feel", observation=looks, action=action)
 
-    def infer(self, _: object) -> ActionSteps:
+    def infer(self, observation: object) -> ActionSteps:
         return ActionSteps(np.zeros((1, 6)))
 
 
