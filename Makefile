@@ -24,7 +24,7 @@ AT_THE_END := --last-failed --last-failed-no-failures none --reruns 0 -r fEs
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-computed test-realtime test-long slow fuzz fuzz-motion mutants soak test-ros2 test-franka test-rivals demo-rivals test-clients test-realsense test-models check format bench flywheel bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
+.PHONY: help setup demo test test-computed test-realtime test-long slow fuzz fuzz-motion mutants soak soak-fleet test-ros2 test-franka test-rivals demo-rivals test-clients test-realsense test-models check format bench flywheel bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -78,6 +78,9 @@ mutants: $(READY) ## Put 200 small faults into the core, one at a time, and tell
 
 soak: $(READY) ## Run the whole chain with random faults; MINUTES=3 for a short one
 	$(BIN)/python reliability/soak/soak.py --minutes $(MINUTES) $(ARGS)
+
+soak-fleet: $(READY) ## Run eight robots, an obeyed model and two in shadow with random faults; MINUTES=3 for a short one
+	$(BIN)/python reliability/soak/fleet.py --minutes $(MINUTES) $(ARGS)
 
 # Of ROS 2 itself the distribution jazzy and what is quick; everything with ALL=1.
 DISTRIBUTIONS := jazzy $(if $(ALL),kilted)

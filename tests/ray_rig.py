@@ -31,8 +31,8 @@ def replicas(folder: Path) -> set[int]:
 
 
 @contextmanager
-def ray_worker(folder: Path, profile: Path, name: str) -> Iterator[None]:
-    """The worker `name`, and a Ray of its own, while the block lasts; says all in `folder`."""
+def ray_worker(folder: Path, profile: Path, name: str) -> Iterator[int]:
+    """The process of the worker `name`, with a Ray of its own; its log is in `folder`."""
     words = [os.environ[VARIABLE], "-m", "vla_zenoh", "worker", name, "--profile", str(profile)]
     # Ray's sockets have names of a hundred characters at most.
     short = tempfile.mkdtemp(prefix="ray", dir="/tmp")
@@ -42,7 +42,7 @@ def ray_worker(folder: Path, profile: Path, name: str) -> Iterator[None]:
             words, env=environment, stdout=log, stderr=log, start_new_session=True
         )
         try:
-            yield
+            yield process.pid
         finally:
             process.terminate()
             try:

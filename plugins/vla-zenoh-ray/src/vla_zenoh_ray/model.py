@@ -94,8 +94,9 @@ class RayServe:
         try:
             where = {"address": self._address} if self._address else {"include_dashboard": False}
             ray.init(logging_level="ERROR", log_to_driver=False, **where)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            raise WorkerError(f"no Ray cluster at {self._address!r}: {error}") from error
+        except Exception as error:  # Ray raises that itself where it does not start in time
+            where_text = f"at {self._address!r}" if self._address else "on this computer"
+            raise WorkerError(f"no Ray cluster {where_text}: {error}") from error
         serve.start(proxy_location="Disabled")
         deployment = serve.deployment(
             Replica,
