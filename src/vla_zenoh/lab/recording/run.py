@@ -174,9 +174,8 @@ class Run:
 
     def prompt_intervals(self) -> list[tuple[int, int, str, str]]:
         """Each interval with one worker obeyed and one prompt in force, after its two ends."""
-        return [
-            (*ends, worker, prompt) for *ends, (worker, prompt) in self._spans("worker", "prompt")
-        ]
+        found = self._spans("worker", "prompt")
+        return [(since, until, worker, prompt) for since, until, (worker, prompt) in found]
 
     def reads_prompts(self, worker: str) -> bool:
         """Whether a worker is a model that is given prompts, by the specs of its chunks."""
