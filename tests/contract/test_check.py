@@ -260,6 +260,12 @@ FIVE_JOINTS = {
 }
 
 
+SEVEN_JOINTS: dict[str, Any] = {
+    "space": "joint",
+    "joints": load_profile("panda_sim").robot.arm_joints,
+}
+
+
 @pytest.mark.parametrize(
     ("declared", "changes", "wanted"),
     [
@@ -285,6 +291,8 @@ FIVE_JOINTS = {
         (spec(FRONT), {"task": {"prompt": ""}}, {("warning", "no_prompt")}),
         (spec(FRONT, horizon=1), {}, {("note", "gaps")}),
         (spec(FRONT), FIVE_JOINTS, {("warning", "too_few_joints")}),
+        (spec(FRONT, **SEVEN_JOINTS), {}, {("warning", "joints_by_pose")}),
+        (spec(FRONT, **SEVEN_JOINTS), {"robot": {"command": "joint"}}, set()),
         (
             spec(FRONT, kind="absolute", rotation="quaternion"),
             FIVE_JOINTS,

@@ -22,7 +22,7 @@ from vla_zenoh.control.lateness import Lateness
 from vla_zenoh.control.monitor import Brake, PartSnapshot, too_near
 from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress
-from vla_zenoh.control.policy_check import Lease, Rejection
+from vla_zenoh.control.policy_check import Lease, Rejection, joints_by_pose
 from vla_zenoh.control.preflight import (
     STOP_LATCHED,
     Passing,
@@ -346,6 +346,8 @@ class Commander:
         held = f", while {holder!r} holds it" if holder else ""
         what = f"activated with worker {self.task.worker!r}{held}"
         self._change(Trigger.ACTIVATE, "; ".join([what, *self._ended_before()])[:MAX_TEXT])
+        if why := joints_by_pose(self.profile, lease.spec.action):
+            self._emit("warning", "notice", "joints_by_pose", why)
         self._new_episode(now_ns)
 
     def _is_answer_due(self, now_ns: int) -> bool:

@@ -157,6 +157,22 @@ def _action_errors(profile: Profile, action: ActionSpec) -> Iterator[Finding]:
         )
 
 
+def joints_by_pose(profile: Profile, action: ActionSpec) -> str:
+    """A sentence where the joints of an action are not what the robot is commanded; else empty."""
+    of_parts = {each.part: each.action for each in action.parts} or {"": action}
+    if all(
+        each.space != "joint" or profile.of_part(part).robot.command == "joint"
+        for part, each in of_parts.items()
+        if part in profile.part_names
+    ):
+        return ""
+    return (
+        "the actions are joints and this robot is commanded by poses: its TCP goes where these "
+        "joints bring it, each joint may be elsewhere; with `robot: {command: joint}` it follows "
+        "the joints themselves"
+    )
+
+
 def few_joints(profile: Profile) -> str:
     """Beginning of a sentence about an arm with fewer joints than a pose needs."""
     robot = profile.robot

@@ -117,3 +117,10 @@ def test_a_far_target_is_approached_as_fast_in_poses_as_in_joints(posture: str) 
 
 def place_m(arm: Joints, joints_rad: FloatArray) -> FloatArray:
     return arm.kinematics.forward(joints_rad).position_m
+
+
+@pytest.mark.parametrize(("command", "told"), [("pose", True), ("joint", False)])
+def test_who_activates_joints_of_a_robot_that_takes_poses_is_told(command: str, told: bool) -> None:
+    arm = Joints(panda(command))
+    arm.activate()
+    assert ("joints_by_pose" in {event.what for event in arm.rig.events}) is told

@@ -15,6 +15,7 @@ from vla_zenoh.control.policy_check import (
     chunk_errors,
     error,
     few_joints,
+    joints_by_pose,
     largest_step,
     outside_workspace_m,
     spec_errors,
@@ -107,6 +108,8 @@ def _timing(profile: Profile, spec: ModelSpec, rate_hz: float) -> Iterator[Findi
 
 
 def _robot(profile: Profile, spec: ModelSpec, worker: str) -> Iterator[Finding]:
+    if why := joints_by_pose(profile, spec.action):
+        yield warning("joints_by_pose", why)
     few = len(profile.robot.arm_joints) < POSE_JOINTS
     if spec.action.space == "tcp" and spec.action.kind != "absolute" and few:
         yield warning(

@@ -120,6 +120,9 @@ def check(
         print_json(report.to_dict())
     else:
         _print(report)
+        if against is None:
+            out = "cameras, joints, limits and rates of a robot are not checked: give --profile"
+            console().print(out, soft_wrap=True)
     failed = not report.ok or (strict and _count(report, "warning"))
     sys.stdout.flush()
     os._exit(1 if failed else 0)  # threads of a model's library may keep the process alive
