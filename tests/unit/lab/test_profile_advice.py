@@ -9,7 +9,7 @@ import pytest
 
 from vla_zenoh import resources
 from vla_zenoh.lab.profile.check import advice, check_profile
-from vla_zenoh.lab.profile.robot_check import barriers_advice
+from vla_zenoh.lab.profile.robot_check import barriers_advice, table_advice
 from vla_zenoh.profile import load_profile, override
 
 SIM = load_profile("panda_sim")
@@ -97,6 +97,14 @@ def test_a_link_and_a_tool_without_a_collision_shape_are_named(tmp_path: Path) -
 
 def test_the_shipped_arms_have_shapes_up_to_their_tool() -> None:
     assert list(barriers_advice(SIM)) == []
+
+
+def test_a_table_that_is_not_where_the_simulator_has_it_is_told() -> None:
+    raised = {"limits": {"reach": {"table_z_m": 0.25}}}
+    assert "stays at 0 m" in "".join(table_advice(override(SIM, raised)))
+    for others in ({}, {"limits": {"reach": {"table_z_m": None}}}):
+        assert not list(table_advice(override(SIM, others)))
+    assert not list(table_advice(override(load_profile("fr3"), raised)))
 
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

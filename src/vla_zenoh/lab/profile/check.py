@@ -24,6 +24,7 @@ from vla_zenoh.lab.profile.robot_check import (
     joints_advice,
     mounts,
     simulator,
+    table_advice,
 )
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import HostProfile, Profile, load_with_lines
@@ -90,6 +91,7 @@ def check_profile(
             hints.append(f"{'.'.join(place)}: on this computer: {why}")
     hints += [
         *barriers_advice(profile),
+        *table_advice(profile),
         *joints_advice(profile),
         *braking_advice(profile),
     ]

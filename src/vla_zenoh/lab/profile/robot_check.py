@@ -131,6 +131,16 @@ def barriers_advice(profile: Profile) -> Iterator[str]:
             )
 
 
+def table_advice(profile: Profile) -> Iterator[str]:
+    """Advice for a table that is elsewhere than the simulated one."""
+    table_z_m = profile.limits.reach.table_z_m
+    if profile.robot.driver == "sim" and table_z_m:
+        yield (
+            f"limits.reach.table_z_m is {table_z_m:g} m, and the simulator's table stays at 0 m: "
+            "the arm stops above what its cameras show; keep-outs are not shown either"
+        )
+
+
 def joints_advice(profile: Profile) -> Iterator[str]:
     """What the check assumes of joints that are not commanded, of home, and of too few joints."""
     try:
