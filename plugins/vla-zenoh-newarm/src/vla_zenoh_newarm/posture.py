@@ -120,7 +120,7 @@ def _home(
         if overlap is None:
             break
         touching = (*touching, overlap)
-    return homes[0], False, ()
+    return homes[len(down)], False, ()  # the best as it is: turned down it may be lower
 
 
 def _overlap(
