@@ -305,11 +305,12 @@ def step_begins(
         followed: chunks that the arm followed, in order.
         dt_s: duration of a step by the hash of its spec.
     """
+    if not followed:
+        return {}
     begins: dict[Header, int] = {}
     runs: list[tuple[float, float]] = []
-    if followed:
-        since_ns = followed[0].record.observation_stamp_ns
-        clock = StepClock(tasks, since_ns, followed[-1].header.stamp_wall_ns, 1.0)
+    since_ns = followed[0].record.observation_stamp_ns
+    clock = StepClock(tasks, since_ns, followed[-1].header.stamp_wall_ns, 1.0)
     for chunk in followed:
         record, published_ns = chunk.record, chunk.header.stamp_wall_ns
         seen, published = clock.steps(record.observation_stamp_ns), clock.steps(published_ns)
