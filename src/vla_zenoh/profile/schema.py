@@ -296,6 +296,7 @@ class Timing(Section):
             activation.
         state_timeout_s: older robot state brakes the arm, which then needs a new activation.
         command_timeout_s: the robot brakes by itself if the command stream is silent for this long.
+            Until then it goes on at its last velocity, wherever that leads: 30 mm at 0.3 m/s.
         max_observation_age_s: a chunk inferred from an older observation is rejected.
         max_open_loop_s: longest part of a chunk that is followed; then it counts as run out.
             Without a new chunk the arm moves for this long, at the speed override, and watchdog_s.
