@@ -28,13 +28,14 @@ def run(seconds, policy):
     profile = override(load_profile("panda_sim"), {"task": {"prompt": "lift"}})
     name, spec = profile.task.worker, policy.spec
     robot, camera = build_world(profile), Renderer(profile.sim.scene, robot_models(profile))
-    commander = Commander(profile, reach=ReachabilityFilter(profile))
+    reach = ReachabilityFilter(profile)
+    commander, velocity_rad_s = Commander(profile, reach=reach), reach.kinematics.velocity_rad_s
 
     def measured():
         joints = robot.joint_state()
         return Measured(Pose(*robot.tcp()), joints.position_rad, joints.velocity_rad_s)
 
-    guard = ArmGuard(profile, measured, robot.joint_range_rad, TICK_MS / 1e3)
+    guard = ArmGuard(profile, measured, robot.joint_range_rad, velocity_rad_s, TICK_MS / 1e3)
     alive = frozenset({"sim", "camera", f"worker-{name}"})
     seen_by = {"camera_ages_s": {"front": 0.0}, "camera_nodes": {"front": "camera"}}
     peers = PeerSnapshot(alive, "sim", {name: spec}, {name: name}, same_host=alive, **seen_by)

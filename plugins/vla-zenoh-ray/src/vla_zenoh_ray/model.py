@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from vla_zenoh.errors import MissingExtraError, WorkerError
+from vla_zenoh.errors import MissingExtraError, WorkerError, in_words
 from vla_zenoh.policy import ActionSteps, Observation, Policy, reset_of, takes_robot
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.options import number, whole_number
@@ -96,7 +96,7 @@ class RayServe:
             ray.init(logging_level="ERROR", log_to_driver=False, **where)
         except Exception as error:  # Ray raises that itself where it does not start in time
             where_text = f"at {self._address!r}" if self._address else "on this computer"
-            raise WorkerError(f"no Ray cluster {where_text}: {error}") from error
+            raise WorkerError(f"no Ray cluster {where_text}: {in_words(error)}") from error
         serve.start(proxy_location="Disabled")
         deployment = serve.deployment(
             Replica,
