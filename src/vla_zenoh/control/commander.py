@@ -502,6 +502,8 @@ class Commander:
         why = "; ".join(reasons if same else lost)[:MAX_TEXT]
         if not why and self._watchdog.given_up(now_ns):
             why = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
+            complaint = self._peers.worker_complaints.get(worker)
+            why += f"; worker {worker!r} reports: {complaint}" if complaint else ""
         if why:
             busy = all(brake.late for brake in lost.values())
             self._change(Trigger.LOSE, why + (self._lateness.explains() if busy else ""))

@@ -181,9 +181,11 @@ def test_an_arm_that_holds_for_long_needs_activation_again() -> None:
     rig.send([UP])
     rig.run(2.0)
     assert rig.state == "holding"
+    rig.peers = replace(rig.peers, worker_complaints={WORKER: "contract: steps hold NaN"})
     rig.run(1.0)
     assert rig.state == "inactive"
     assert "held for 2 s" in rig.commander.why
+    assert f"worker {WORKER!r} reports: contract: steps hold NaN" in rig.commander.why
     rig.send([UP])
     assert rig.state == "inactive"
     np.testing.assert_allclose(rig.moved_m(), [0, 0, STEP_M], atol=AT_GOAL_M)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from camera_rig import routed_session
@@ -10,7 +12,14 @@ from vla_zenoh.bus.buffers import Wake, bytes_of
 from vla_zenoh.codec import records
 from vla_zenoh.errors import PromptError
 from vla_zenoh.nodes.worker.robot_session import RobotSession
-from vla_zenoh.policy import ActionSpec, ActionSteps, CameraSpec, ModelSpec, ObservationSpec
+from vla_zenoh.policy import (
+    ActionSpec,
+    ActionSteps,
+    CameraSpec,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+)
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Task
 
@@ -65,3 +74,23 @@ def test_only_a_worker_that_is_chosen_counts_a_prompt_that_it_does_not_know(
         worker.close()
     assert worker.complaint == "contract: it knows no 'dance'"
     assert dict(worker.node.counters) == counted
+
+
+def test_why_an_answer_was_rejected_is_told_until_the_next_good_one() -> None:
+    profile, model = load_profile("panda_sim"), Feel((), ())
+    with routed_session() as session:
+        worker = RobotSession(
+            profile, session, model, "feel", images="raw", host=None, changed=Wake()
+        )
+        seen = Observation(time.time_ns(), 1, Task(1, True, "go", "feel", 5.0))
+        told = []
+        for value in (np.nan, np.nan, 0.0):
+            answer = ActionSteps(np.full((1, 6), value))
+            worker.publish(seen, answer, (time.time_ns(),) * 3, 1)
+            worker.task = seen.task
+            worker._task_received_s = time.monotonic()
+            assert worker.observe() is not None
+            told.append(worker.complaint)
+        worker.close()
+    assert told[0] == told[1] == "contract: steps hold NaN or infinity"
+    assert told[2] == ""

@@ -119,7 +119,8 @@ class RobotSession:
         self._inference_ms = Percentiles(128)
         self._batch, self._last_spec_s = 0, -1e9
         self.complaint = LOADING
-        """Why there is no inference; empty if there is."""
+        """Why there is no inference, or no answer of the last one; empty if there is."""
+        self._failure = ""
         self.due_s = 0.0
         """When the next inference is due, monotonic clock."""
 
@@ -204,7 +205,7 @@ class RobotSession:
                 self.node.emit(Event("warning", "fault", "same_image", why[:1000]))
             self._repeats, self.complaint = True, why
             return None
-        self._repeats, self.complaint = False, ""
+        self._repeats, self.complaint = False, self._failure
         if self._cameras and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
             tolerance_s = min(FRESH_TOLERANCE_S, 0.25 / observation.rate_hz)
             if min(camera.received_s for camera in self._cameras) < self.due_s - tolerance_s:
@@ -245,6 +246,7 @@ class RobotSession:
         except Exception as error:
             self.failed(error)
             return None
+        self.complaint = self._failure = ""
         _, start_ns, end_ns = times_ns
         patience_s = self.node.profile.timing.max_observation_age_s
         chunk = make_chunk(
@@ -279,7 +281,7 @@ class RobotSession:
         elif not reason:
             reason = "contract" if isinstance(error, SpecError) else "inference_failed"
         why = in_words(error)
-        self.complaint = f"{reason}: {why}"
+        self.complaint = self._failure = f"{reason}: {why}"
         chosen = self.task is None or self.task.worker == self.name
         if chosen or not isinstance(error, PromptError):
             self.node.reject(reason, why)
