@@ -31,7 +31,7 @@ def status(
     as_json: JsonOption = False,
     once: Annotated[bool, typer.Option("--once", help="Print the table once and exit.")] = False,
 ) -> None:
-    """Show every node: state, age, rates, latencies, rejected messages, and the last events.
+    """Show every node: state, age, rates, latencies, rejected messages, and events as they come.
 
     The table counts rejected messages only; --json has every counter.
     """
