@@ -91,8 +91,8 @@ def segment_rows(run: Evaluation) -> list[tuple[str, ...]]:
             (
                 found.prompt,
                 str(found.requests),
-                number(asked, unit, digits),
-                number(along, unit, digits),
+                number(asked or None, unit, digits),
+                number(along if asked else None, unit, digits),
                 number(found.drift_m, "mm", 2, 1e3),
                 number(found.drift_rad, "mrad", 2, 1e3),
                 NONE if width is None else f"{width[0] * 1e3:.1f} to {width[1] * 1e3:.1f} mm",
