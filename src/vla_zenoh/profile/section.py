@@ -73,7 +73,7 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
 Name = Annotated[str, AfterValidator(partial(key_chunk, what="name"))]
 Text = Annotated[str, Field(max_length=MAX_TEXT)]
 Word = Annotated[str, Field(min_length=1, max_length=512)]
-Names = Annotated[tuple[Name, ...], Field(strict=False, max_length=64), AfterValidator(_differ)]
+Names = Annotated[tuple[Name, ...], Field(strict=False, max_length=128), AfterValidator(_differ)]
 Words = Annotated[tuple[Word, ...], Field(strict=False, max_length=64), AfterValidator(_differ)]
 Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_ordered)]
 Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
