@@ -146,9 +146,9 @@ def _fit(model: mujoco.MjModel, robots: Sequence[RobotModel]) -> None:
             data.joint(prefix_of(robot) + name).qpos[0] = position
     mujoco.mj_forward(model, data)
     for robot in own_arms:
+        own = _moving(model, robot)
+        _let_through(model, data, own)
         if robot.camera is not None:
-            own = _moving(model, robot)
-            _let_through(model, data, own)
             camera = model.camera(_camera_name(robot)).id
             beside_hand(
                 *(model, data, camera, own),
