@@ -184,7 +184,7 @@ class AxisSmoother:
         way = target - self.state.position
         way[np.abs(way) < SOLVER_NOISE[0]] = 0.0
         plan, enough = self._towards(way, limits, unreversed, all_to_stop)
-        self._begin(plan)
+        self._begin(plan, shares)
         self._too_fast = self._slows() & (np.abs(self.state.velocity) > limits[0])
         again = self._too_fast.any() and not self.braking
         self._again = (shares, all_to_stop) if again else None
@@ -207,15 +207,15 @@ class AxisSmoother:
         self._settle(FULL)
         limits = self.box if shares is None else self._limits(shares)[1]
         self._again, self.braking = None, True
-        self._begin(self._stop(limits, together=shares is not None))
+        self._begin(self._stop(limits, together=shares is not None), shares or FULL)
 
     # -- planning -----------------------------------------------------------------------------
-    def _begin(self, plan: AxisPlan | None) -> None:
+    def _begin(self, plan: AxisPlan | None, shares: Shares) -> None:
         """Execute `plan`; without one brake, and if that cannot be planned, stand."""
         self._elapsed_s = 0.0
         if plan is None:
             self.failures += 1
-            self.failure = self._described()
+            self.failure = self._described(shares)
             self.braking = True
             plan = self._stop(self.box, together=False)
         if plan is None:
@@ -223,10 +223,10 @@ class AxisSmoother:
         else:
             self._plan = plan
 
-    def _described(self) -> str:
+    def _described(self, shares: Shares) -> str:
         values = {**self.state._asdict(), "target": self._target, "jerk": self._jerk}
         given = ", ".join(f"{name} {value.tolist()}" for name, value in values.items())
-        return f"{given}, time scale {self._time_scale!r}, limits {self.box.tolist()}"
+        return f"{given}, shares {[*shares]}, limits {self.box.tolist()}"
 
     def _towards(
         self, way: FloatArray, limits: FloatArray, unreversed: FloatArray, all_to_stop: bool
