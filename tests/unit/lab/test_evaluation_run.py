@@ -484,7 +484,7 @@ def test_nothing_is_written_where_nothing_could_be_evaluated(tmp_path: Path) -> 
     page = tmp_path / "run.html"
     done = CliRunner().invoke(app, ["eval", str(tmp_path / "run.mcap"), "-o", str(page)])
     assert done.exit_code == 1
-    assert "run.part.mcap is being written still" in " ".join(done.stderr.split())
+    assert "run.part.mcap is there: its recorder still runs" in " ".join(done.stderr.split())
     assert not page.exists()
 
 

@@ -347,8 +347,10 @@ def _segments(
     """A segment for each prompt in force while the arm was active."""
     zero_ns = run.began_ns
     steps = {(e.record.worker, e.header.seq): len(e.record.steps) for e in run.chunks}
-    for since_ns, end_ns, worker, prompt in run.prompt_intervals():
-        if run.reads_prompts(worker):
+    intervals = run.prompt_intervals()
+    reads = {worker: run.reads_prompts(worker) for worker in {each[2] for each in intervals}}
+    for since_ns, end_ns, worker, prompt in intervals:
+        if reads[worker]:
             out.prompts.append(prompt)
         else:
             prompt = f"({worker})"

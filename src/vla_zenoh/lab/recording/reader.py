@@ -383,7 +383,8 @@ def open_recording(path: Path) -> Recording:
                     return Recording(path, about, profile_yaml)
     except OSError as error:
         unfinished = path.with_suffix(f".part{path.suffix}")
-        hint = f"; {unfinished.name} is being written still" if unfinished.exists() else ""
+        hint = f"; {unfinished.name} is there: its recorder still runs, or was killed"
+        hint = hint if unfinished.exists() else ""
         raise RecordingError(f"{path} cannot be read: {error.strerror}{hint}") from error
     if problems and not topics:
         raise RecordingError(f"{path} is {problems[0]}, before anything of the run")
