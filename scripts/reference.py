@@ -413,7 +413,7 @@ def counted_in_code() -> tuple[set[str], set[str]]:
     """Reasons of rejections, and names of other counters, that are written in the code."""
     reasons, counters = set(), set()
     source = [path for path in SOURCE.rglob("*.py") if "cli" not in path.relative_to(SOURCE).parts]
-    for name in ("policy-servers", "rolling", "ros2", "serve", "teleop"):
+    for name in ("diagnose", "policy-servers", "rolling", "ros2", "serve", "teleop"):
         source += (ROOT / "plugins" / f"vla-zenoh-{name}").rglob("*.py")
     for path in (*source, *(ROOT / "models").glob("*/wire.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):

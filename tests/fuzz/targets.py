@@ -22,6 +22,8 @@ import numpy as np
 import r2c_peer
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
+from vla_zenoh_diagnose import inferences, net
+from vla_zenoh_diagnose.inference_views import InferenceView
 from vla_zenoh_franka_node import wire as franka_node
 from vla_zenoh_mcp import protocol
 from vla_zenoh_policy_servers import message as arrays
@@ -41,14 +43,11 @@ from vla_zenoh.client.answer import Answer, decode_answer
 from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.cli import inspect as cli_inspect
 from vla_zenoh.lab.cli import keys as cli_keys
-from vla_zenoh.lab.cli import net as cli_net
 from vla_zenoh.lab.cli.options import number_list
 from vla_zenoh.lab.cli.output import plain_types
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
-from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.tasks.order import parse_prompt
@@ -168,8 +167,8 @@ def _told(data: bytes) -> None:
     nodes = {"command": found, "a\x1b[2J[/b]": other}
     heard = {name: (status, 0.1, True) for name, status in nodes.items()}
     assert _display(cli_status.render("panda", heard, [])) < MAX_SHOWN
-    pairs, lines = cli_net.pairs_of(nodes, []), cli_net.lines_of(nodes)
-    _display(*cli_net.tables("panda", pairs, lines, 100.0))
+    pairs, lines = net.pairs_of(nodes, []), net.lines_of(nodes)
+    _display(*net.tables("panda", pairs, lines, 100.0))
     _display(cli_keys.table(cli_keys.image_keys(Keys("panda"), heard)))
 
 
@@ -181,7 +180,7 @@ def _event_told(data: bytes) -> None:
 
 def _sight(data: bytes) -> None:
     sight = InferenceView(records.decode(InferenceDebug, data), {"front": data})
-    assert _display(cli_inspect.table({"w": sight})) < MAX_SHOWN
+    assert _display(inferences.table({"w": sight})) < MAX_SHOWN
 
 
 def _options(data: bytes) -> None:

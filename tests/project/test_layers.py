@@ -63,7 +63,6 @@ ALLOWED = {
             "lab/check/model_runner.py",
             "lab/doctor/access.py",
             "lab/episode.py",
-            "lab/inference_views.py",
             "lab/newest_records.py",
             "lab/recording/recorder.py",
             "lab/recording/sample_queue.py",

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 from chain import MOVING_M_S, READY_PATIENCE_S, Chain, command_line
+from vla_zenoh_diagnose.inference_views import InferenceDebugSubscriber, InferenceView
 
 from vla_zenoh.bus.host import own_boot_id
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.profile import override
 from vla_zenoh.runtime.launch import Host
 

@@ -16,10 +16,10 @@ from rich.panel import Panel
 from rich.progress import Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
+from vla_zenoh_diagnose import net
 
 from vla_zenoh.cli import status_table
 from vla_zenoh.cli.output import Screen, styled
-from vla_zenoh.lab.cli import net
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, Header, NodeStatus
 

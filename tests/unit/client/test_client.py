@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import zenoh
 from camera_rig import PATIENCE_S, await_match, free_endpoint, until
+from vla_zenoh_diagnose.inference_views import MAX_SAMPLES, InferenceDebugSubscriber
 from vla_zenoh_web.robot_link import RobotLink
 
 from vla_zenoh import keys
@@ -23,7 +24,6 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import Kind
-from vla_zenoh.lab.inference_views import MAX_SAMPLES, InferenceDebugSubscriber
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import Event, Header, InferenceDebug, JointState, NodeStatus, PoseState

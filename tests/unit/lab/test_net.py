@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from vla_zenoh.lab.cli.net import NOBODY, Line, lines_of, pairs_of
+from vla_zenoh_diagnose.net import NOBODY, Line, lines_of, pairs_of
+
 from vla_zenoh.types import NodeStatus
 
 HZ, BYTES_S = 200.0, 20_000.0

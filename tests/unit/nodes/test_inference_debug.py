@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from vla_zenoh_diagnose.inference_views import MAX_WAITING, PendingImages
 
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.lab.inference_views import MAX_WAITING, PendingImages
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.types import InferenceDebug
 from vla_zenoh.types.records import plain_values

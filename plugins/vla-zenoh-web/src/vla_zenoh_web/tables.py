@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+from vla_zenoh_diagnose.net import pairs_of
+
 from vla_zenoh.cli.node_rows import hosts_down, node_rows
 from vla_zenoh.client.client import Client
-from vla_zenoh.lab.cli.net import pairs_of
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, Header
 

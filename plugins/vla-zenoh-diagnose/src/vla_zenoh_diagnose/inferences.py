@@ -23,10 +23,10 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.cli.options import EndAfterOption
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
-from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.runtime.process import stop_on_signals
 from vla_zenoh.sanitize import one_line
+from vla_zenoh_diagnose.inference_views import InferenceDebugSubscriber, InferenceView
 
 POLL_S = 0.05
 PATIENCE_S = 5.0

@@ -1,0 +1,1 @@
+"""What a model got and answered, and what travels between hosts."""
