@@ -99,7 +99,8 @@ class Load:
         """
         names = [f"r{number}" for number in range(1, max(counts) + 1)]
         served = {"robot": {"name": names[0]}, "serves": {WORKER: names}}
-        file = self._file(override(self._profile, served))
+        self._profile = override(self._profile, served)
+        file = self._file(self._profile)
         self._start("worker", ("worker", WORKER, "--profile", str(file)))
         for count in sorted(counts):
             for name in names[len(self._clients) : count]:
