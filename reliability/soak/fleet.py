@@ -252,6 +252,7 @@ class Fleet:
             os.kill(pid, signal.SIGSTOP)
             time.sleep(FREEZE_S)
             os.kill(pid, signal.SIGCONT)
+            self._ledger.links_broke()
         else:
             os.kill(pid, signal.SIGKILL)
             self._killed_s[where, node] = hit_s

@@ -26,6 +26,8 @@ ROUTER_MIB = 24.0
 dies; the other nodes gained 7.6 at most in an hour."""
 CALM_MIB = 8.0
 """And so much in the calm at the end, in which nothing dies."""
+LINKS_SETTLE_S = 20.0
+"""After all links broke at once: then the pools hold a thread for each of them until 10 s later."""
 
 
 class Held(NamedTuple):
@@ -149,16 +151,23 @@ class Ledger:
         self._pids = pids
         self._seen: dict[tuple[str, int], list[Held]] = {}
         self._born_s: dict[tuple[str, int], float] = {}
+        self._settled_s = 0.0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="ledger", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
         while not self._stop.wait(PERIOD_S):
+            if time.monotonic() < self._settled_s:
+                continue
             for who in dict(self._pids()).items():
                 born_s = self._born_s.setdefault(who, time.monotonic())
                 with suppress(OSError, KeyError, ValueError):
                     self._seen.setdefault(who, []).append(look(who[1], time.monotonic() - born_s))
+
+    def links_broke(self) -> None:
+        """Do not look until the threads that waited for the broken links have ended."""
+        self._settled_s = time.monotonic() + LINKS_SETTLE_S
 
     def newest(self) -> dict[str, Held]:
         """Node -> what its present process holds."""

@@ -136,6 +136,25 @@ def test_what_this_process_holds_is_seen() -> None:
     ledger.close()
 
 
+def test_nothing_is_looked_at_while_broken_links_settle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ledger.PERIOD_S", 0.01)
+    looks: list[float] = []
+
+    def pids() -> dict[str, int]:
+        looks.append(time.monotonic())
+        return {}
+
+    ledger = Ledger(pids)
+    while not looks:
+        time.sleep(0.01)
+    ledger.links_broke()
+    time.sleep(0.05)
+    seen = len(looks)
+    time.sleep(0.2)
+    assert len(looks) == seen
+    ledger.close()
+
+
 def test_a_witness_sees_a_stall_once() -> None:
     witness, usual_s = Witness(), sys.getswitchinterval()
     sys.setswitchinterval(10 * HELD_S)  # nobody else runs until this thread lets go
