@@ -559,6 +559,6 @@ def followed_shares(
     velocity, _, jerk = (limits / needed).min(axis=1)
     fastest = min(rates[0] * velocity, float(np.min(np.sqrt(bend * limits[1] / bends))))
     reached = min(fastest, (now * now + rates[1]) ** 0.5)
-    left = np.maximum(limits[1] - bends * reached * reached, (1 - bend) * limits[1])
+    left = limits[1] - bends * reached * reached  # at least the part 1 - bend, by `fastest`
     parts = np.clip([fastest / rates[0], (left / needed[1]).min(), jerk], LEAST_TO_GOAL, 1.0)
     return Shares(*(float(part) for part in parts))

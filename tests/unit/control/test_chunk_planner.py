@@ -322,6 +322,18 @@ def test_a_far_turn_is_approached_likewise() -> None:
     assert max(turning) <= rig.profile.limits.approach_rad_s * (1 + 1e-6)
 
 
+@pytest.mark.parametrize(("far_m", "far_rad", "unit"), [(0.2, 0.3, "m"), (0.1, 0.7, "rad")])
+def test_a_far_target_is_told_in_the_unit_of_which_it_takes_more_steps(
+    far_m: float, far_rad: float, unit: str
+) -> None:
+    """Of 0.05 m and 0.2 rad at most: the first takes 4 steps and 1.5, the second 2 and 3.5."""
+    rig = absolute_rig(profile(limits={"step_m": 0.05, "step_rad": 0.2}))
+    go(rig, [*(START_M + [far_m, 0.0, 0.0]), *quat_of([0.0, 0.0, far_rad])], 0.5)
+    (event,) = [event for event in rig.events if event.what == "approach"]
+    assert f" {unit} away" in event.why
+    assert event.value == pytest.approx(far_m if unit == "m" else far_rad)
+
+
 def test_an_approach_that_a_profile_declares_faster_is_faster() -> None:
     rig = absolute_rig(profile(limits={"approach_m_s": 0.3}))
     go(rig, [*(START_M + [0.3, 0.0, 0.0]), *DOWN], 1.5)

@@ -368,6 +368,7 @@ def test_targets_in_degrees_are_rejected_with_the_joint_and_its_range() -> None:
 
 
 DEGREES = np.array([5.0, -9.0, 11.0, 4.0, 2.0])
+ELBOW = np.array([0.0, 0.0, 11.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -376,6 +377,7 @@ DEGREES = np.array([5.0, -9.0, 11.0, 4.0, 2.0])
         ({}, DEGREES, "not sane: joint_limit: a target of elbow_flex at 11 rad"),
         ({}, 57.0 * DEGREES, "not sane: joint_units: a target of a joint of 627 rad"),
         ({"kind": "delta"}, DEGREES, "not sane: joint_units: a step of a joint of 11 rad"),
+        ({"kind": "delta"}, ELBOW, "not sane: joint_units: a step of a joint of 11 rad"),
         ({"kind": "velocity"}, 5 * DEGREES, "not sane: joint_units: a step of a joint of 5.5 rad"),
         (
             {"kind": "delta", "relative_to": "start"},

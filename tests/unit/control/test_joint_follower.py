@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.joint_follower import JointFollower
+from vla_zenoh.control.joint_follower import DistanceConstraints, JointFollower
 from vla_zenoh.control.limits import into_workspace, joint_motion_limits, motion_limits
 from vla_zenoh.control.pose_to_joint import FAR, LAG_M, LAG_RAD, PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
@@ -258,6 +258,12 @@ def test_commanded_joints_stop_before_the_arm_touches_itself_or_the_table(
     assert -BEYOND_STOP_M < nearest_m < 0.005
     assert name in arm.stage.stuck
     assert arm.jerk <= 1.0 + LEAST_JERK_RTOL
+
+
+def test_a_face_of_the_box_is_told_as_the_workspace_whatever_else_is_near() -> None:
+    constraints = DistanceConstraints(BASE.limits, ReachabilityFilter(BASE, KINEMATICS).barriers)
+    constraints.update(HOME_RAD)
+    assert [constraints.hit(face, 0.001).name for face in range(6)] == ["workspace"] * 6
 
 
 def test_slopes_of_distances_are_those_of_small_steps() -> None:

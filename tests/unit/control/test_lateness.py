@@ -61,6 +61,7 @@ def test_a_hold_for_want_of_a_chunk_says_that_ticks_were_late() -> None:
 def test_what_was_long_ago_explains_nothing(later_s: float) -> None:
     lateness = Lateness(0.004)
     lateness.add(50, START_NS)
+    assert "10% of the ticks" in lateness.explains()
     assert "0.200 s late" in lateness.explains()
     lateness.add(0, START_NS + round(later_s * 1000) * MS)
     assert lateness.explains() == ""

@@ -13,6 +13,7 @@ from described_arms import SEVEN, TOOL, Row, Y, arm, urdf
 from vla_zenoh.kinematics.collision import HELD, CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import KeepOut
+from vla_zenoh.types import HeldBox
 
 NEAR_M = 0.05
 JOINTS = tuple(f"j{n}" for n in range(1, 8))
@@ -78,3 +79,18 @@ def test_a_mesh_is_as_large_as_its_scale_says(
     first = [pair.first == arm(SEVEN)[0].link for pair in collisions.pairs]
     apart = [pair.second == "point" for pair in collisions.pairs]
     assert distances_m[np.logical_and(first, apart)] == pytest.approx(-0.001, abs=0.001)
+
+
+def test_a_held_box_is_where_the_gripper_holds_it(tmp_path: Path) -> None:
+    """A box of 0.04 m whose middle is 0.1 m before the TCP, along its z axis."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf([*arm(SEVEN), TOOL]))
+    kinematics = Kinematics(path, "tcp", JOINTS)
+    tcp = kinematics.forward(np.zeros(kinematics.size))
+    end_m = tcp.position_m + tcp.rotation @ [0.0, 0.0, 0.15]
+    point = KeepOut(centre_m=tuple(end_m.tolist()), radius_m=0.01)
+    collisions = CollisionModel(kinematics, near_m=NEAR_M, keep_out={"point": point})
+    collisions.hold(HeldBox((0.04, 0.04, 0.04), (0.0, 0.0, 0.1)))
+    distances_m = collisions.distances(np.zeros(kinematics.size))
+    held = [(pair.first, pair.second) == (HELD, "point") for pair in collisions.pairs]
+    assert distances_m[held] == pytest.approx(0.15 - 0.12 - 0.01, abs=1e-4)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from vla_zenoh.kinematics.so3 import (
     Pose,
     angle_between,
+    cross3,
     exp3,
     interpolate,
     log3,
@@ -120,3 +121,10 @@ def test_between_goes_straight_from_start_to_end(
     assert angle_between(pose.rotation, end.rotation) == pytest.approx(
         (1 - share) * norm3(turn), abs=LOG_ATOL_RAD
     )
+
+
+def test_a_cross_product_is_right_handed() -> None:
+    x, y, z = np.eye(3)
+    np.testing.assert_array_equal(cross3(x, y), z)
+    np.testing.assert_array_equal(cross3(y, z), x)
+    np.testing.assert_array_equal(cross3(z, x), y)
