@@ -5,6 +5,8 @@
     joint_states     sensor_msgs/JointState      out, 200 Hz
     desired_pose     geometry_msgs/PoseStamped   in
     joint_command    std_msgs/Float64MultiArray  in, rad: the arm is there at its next tick
+    joint_trajectory trajectory_msgs/JointTrajectory  in, with "trajectory": the same, of its end
+    robot_description  std_msgs/String           out, once and latched, with "description": a file
     gripper_width    std_msgs/Float64            in, m between the fingers
     gripper/move, gripper/grasp                  franka_msgs actions, served
     /tf, /tf_static                              tf2_msgs/TFMessage, out
@@ -22,6 +24,7 @@ import json
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,9 +40,10 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64, Float64MultiArray
+from std_msgs.msg import Float64, Float64MultiArray, String
 from tf2_msgs.msg import TFMessage
 from told import obey, tell
+from trajectory_msgs.msg import JointTrajectory
 
 SETTINGS = {
     "namespace": "",
@@ -49,6 +53,8 @@ SETTINGS = {
     "sim_time": 0.0,  # how fast simulated time goes; 0: none
     "goals": {},  # QoS of the topic of poses
     "states": {},  # QoS of the joint states
+    "trajectory": "",  # topic of joint trajectories; empty: none
+    "description": "",  # file of its description; empty: not published
     "serialized": False,  # joint states as bytes, as `ros2 bag play` publishes them
 }
 FOLLOW_1_S = 30.0
@@ -107,6 +113,13 @@ class Arm:
         )
         node.create_subscription(Float64, "gripper_width", self._on_width, 10)
         node.create_subscription(Float64MultiArray, "joint_command", self._on_joints, 1)
+        if settings["trajectory"]:
+            topic = settings["trajectory"]
+            node.create_subscription(JointTrajectory, topic, self._on_trajectory, 1)
+        if settings["description"]:
+            latched = qos(transient_local=True, depth=1)
+            text = Path(settings["description"]).read_text("utf-8")
+            node.create_publisher(String, "robot_description", latched).publish(String(data=text))
         self._tf = node.create_publisher(TFMessage, "/tf", 100)
         fixed = node.create_publisher(TFMessage, "/tf_static", qos(transient_local=True, depth=1))
         mount = self._transform("front_color_optical_frame", np.eye(4))
@@ -131,6 +144,13 @@ class Arm:
         with self._lock:
             self._joint_goal_rad = np.array(message.data)
         tell(joint_goal=list(message.data))
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        goal = dict(zip(message.joint_names, message.points[-1].positions, strict=True))
+        prefix = self._settings["prefix"]
+        with self._lock:
+            self._joint_goal_rad = np.array([goal[prefix + name] for name in panda_dh.JOINTS])
+        tell(joint_goal=list(message.points[-1].positions))
 
     def _on_width(self, message: Float64) -> None:
         tell(width=message.data)

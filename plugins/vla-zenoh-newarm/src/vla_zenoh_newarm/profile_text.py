@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from vla_zenoh.profile import write_yaml
 from vla_zenoh_newarm.arm import Arm
@@ -20,6 +22,9 @@ DRIVER = """\
   # ros2, franka, ur or lerobot; see docs/how-to/own-arm.md. `vla-zenoh up FILE --sim` simulates it
   # all the same.
 """
+OF_ROS2 = """\
+  # `vla-zenoh up FILE --sim` simulates it all the same.
+"""
 LIMITS = """\
 limits: # half the velocity of the description, at most 1 rad/s
 """
@@ -28,7 +33,31 @@ UNCONFIRMED = """\
 """
 
 
-def profile_text(name: str, source: str, description: str, arm: Arm) -> str:
+class Drive(NamedTuple):
+    """What drives an arm in its profile: the simulator, or ``ros2``.
+
+    Args:
+        driver: of the robot.
+        command: ``joint`` or ``pose``.
+        ros2: section of that name; empty: none.
+        cameras: section of that name, of ROS 2.
+    """
+
+    driver: str = "sim"
+    command: str = "joint"
+    ros2: Mapping[str, Any] = {}
+    cameras: Mapping[str, Mapping[str, Any]] = {}
+
+
+SCENE: Mapping[str, Mapping[str, Any]] = {
+    "front": {"source": "sim:front"},
+    "wrist": {"source": "sim:wrist"},
+}
+WATCHED = "front"
+"""Camera whose images the scripted worker waits for."""
+
+
+def profile_text(name: str, source: str, description: str, arm: Arm, drive: Drive) -> str:
     """The profile of an arm.
 
     Args:
@@ -36,7 +65,10 @@ def profile_text(name: str, source: str, description: str, arm: Arm) -> str:
         source: what it was made from.
         description: path that the profile names.
         arm: what is known and guessed.
+        drive: what drives it.
     """
+    simulated = drive.driver == "sim"
+    about = "on a table, simulated until its driver is named" if simulated else "in ROS 2"
     links, motion, home = arm.structure, arm.motion, arm.posture
     guessed = {guess.place for guess in arm.guesses}
 
@@ -46,13 +78,13 @@ def profile_text(name: str, source: str, description: str, arm: Arm) -> str:
     x_m, y_m, z_m = (_row(span) for span in home.workspace_m)
     lines = [
         FIRST.format(name=name, source=source).rstrip(),
-        f"about: {_text(name)} on a table, simulated until its driver is named",
+        f"about: {_text(name)} {about}",
         "",
         "robot:",
         f"  name: {_text(name)}",
-        DRIVER.rstrip(),
-        "  driver: sim",
-        "  command: joint",
+        (DRIVER if simulated else OF_ROS2).rstrip(),
+        f"  driver: {drive.driver}",
+        f"  command: {drive.command}",
         *(f"  # {change}" for change in arm.changes),
         f"  description: {_text(description)}{mark('robot.description')}",
         f"  base_frame: {_text(links.base)}{mark('robot.base_frame')}",
@@ -84,16 +116,15 @@ def profile_text(name: str, source: str, description: str, arm: Arm) -> str:
         f"    table_z_m: {table}{mark('limits.reach.table_z_m')}",
         *_may_touch(home.may_touch),
         "",
-        "cameras: # of the scene; a real arm has others",
-        '  front: {source: "sim:front"}',
-        '  wrist: {source: "sim:wrist"}',
+        *_driven(drive, mark),
         f"sim: {{scene: {'desk' if home.reach_m < SMALL_M else 'bricks'}}}",
         "",
         "workers: [scripted]",
         "task: {prompt: hold, rate_hz: 5, worker: scripted}",
+        *_watched(drive),
         "hosts:",
         "  here:",
-        "    nodes: [router, sim, camera, command, worker]",
+        f"    nodes: [router, {'sim, camera' if simulated else 'ros2'}, command, worker]",
     ]
     if arm.guesses:
         lines += ["", UNCONFIRMED.rstrip(), "unconfirmed:"]
@@ -102,6 +133,44 @@ def profile_text(name: str, source: str, description: str, arm: Arm) -> str:
             lines += [f"  # {each}" for each in what]
             lines += [f"  - {place}"]
     return "\n".join(lines) + "\n"
+
+
+def _driven(drive: Drive, mark: Callable[[str], str]) -> list[str]:
+    """Cameras, and what drives the arm."""
+    if drive.driver == "sim":
+        head, cameras = "cameras: # of the scene; a real arm has others", SCENE
+    else:
+        head, cameras = "cameras:" if drive.cameras else "cameras: {}", drive.cameras
+    lines = [
+        head,
+        *(f"  {name}: {_flow(row)}{mark(f'cameras.{name}')}" for name, row in cameras.items()),
+    ]
+    if drive.ros2:
+        lines += ["", "ros2:"]
+    for key, value in drive.ros2.items():
+        if key == "cameras":
+            lines += ["  cameras:", *(f"    {name}: {_flow(row)}" for name, row in value.items())]
+        else:
+            lines.append(f"  {key}: {_flow(value)}{mark(f'ros2.{key}')}")
+    return [*lines, ""] if drive.ros2 else lines
+
+
+def _watched(drive: Drive) -> list[str]:
+    """Options of the scripted worker where no camera has the name that it waits for."""
+    if drive.driver == "sim" or WATCHED in drive.cameras:
+        return []
+    return [f"options: {{scripted: {{camera: {_flow(next(iter(drive.cameras), ''))}}}}}"]
+
+
+def _flow(value: Any) -> str:
+    """A value on one line."""
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key}: {_flow(each)}' for key, each in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_flow, value))}]"
+    if isinstance(value, str):
+        return json.dumps(value) if set(value) & set(":,{}[]") else _text(value)
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}"
 
 
 def _may_touch(pairs: Sequence[tuple[str, str]]) -> list[str]:

@@ -63,7 +63,7 @@ def read_view(replies: Replies) -> BridgeView:
             continue
         seen = participants.setdefault(chunks[1], set())
         if chunks[3] == "config":
-            domain = _json(payload).get("domain")
+            domain = read_json(payload).get("domain")
             domains[chunks[1]] = domain if isinstance(domain, int) else None
         elif chunks[3] == "dds" and len(chunks) == 5:
             seen.add(chunks[4])
@@ -82,7 +82,7 @@ def route_key(topic: str) -> str:
 
 def any_active(replies: Replies) -> bool:
     """Whether a route in replies to `route_key` passes messages on."""
-    return any(_json(payload).get("is_active") is True for _, payload in replies)
+    return any(read_json(payload).get("is_active") is True for _, payload in replies)
 
 
 def vendors(replies: Replies) -> frozenset[str]:
@@ -94,7 +94,7 @@ def vendors(replies: Replies) -> frozenset[str]:
 def any_transient_local(replies: Replies) -> bool:
     """Whether an end in replies to `endpoints_key` is transient_local."""
     for _, payload in replies:
-        qos = _json(payload).get("qos")
+        qos = read_json(payload).get("qos")
         durability = qos.get("durability") if isinstance(qos, dict) else None
         kind = durability.get("kind") if isinstance(durability, dict) else durability
         if kind not in (None, "VOLATILE", 0):
@@ -102,7 +102,8 @@ def any_transient_local(replies: Replies) -> bool:
     return False
 
 
-def _json(payload: bytes) -> dict[str, Any]:
+def read_json(payload: bytes) -> dict[str, Any]:
+    """A JSON object that a bridge replies with; what is none is empty."""
     try:
         found = json.loads(payload)
     except (ValueError, RecursionError):

@@ -7,6 +7,7 @@ by which bridges tell each other what to route. ``rmw_zenoh``: those of robots t
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,6 +29,15 @@ def dds_type(kind: str) -> str:
     """``sensor_msgs/msg/Image`` -> ``sensor_msgs::msg::dds_::Image_``."""
     package, room, name = split_type(kind)
     return f"{package}::{room}::dds_::{name}_"
+
+
+_DDS_TYPE = re.compile(r"([a-z][a-z0-9_]*)::(msg|srv|action)::dds_::([A-Za-z]\w*)_")
+
+
+def ros_type(dds: str) -> str | None:
+    """The reverse of `dds_type`; None: it is no type of ROS."""
+    match = _DDS_TYPE.fullmatch(dds)
+    return None if match is None else "/".join(match.groups())
 
 
 class Operation(NamedTuple):
@@ -187,6 +197,35 @@ class RmwZenoh:
         return (
             f"@ros2_lv/{self.domain}/{self.session_id}/0/{number}/{role}/{root}/{root}/{self.node}"
         )
+
+
+class Announced(NamedTuple):
+    """An end of a topic or service that a node of rmw_zenoh announces: what its token says."""
+
+    domain: int
+    role: str
+    node: str
+    name: str
+    type: str
+    type_hash: str
+
+
+TOKENS_OF_RMW = "@ros2_lv/**"
+"""Key expression of all tokens of rmw_zenoh, in every domain."""
+_ANNOUNCED = 13
+"""Chunks of the token of an end."""
+
+
+def read_token(token: str) -> Announced | None:
+    """What a token of rmw_zenoh says; None: it is none of an end in a ROS graph."""
+    chunks = token.split("/")
+    if len(chunks) != _ANNOUNCED or chunks[0] != "@ros2_lv" or not chunks[1].isdecimal():
+        return None
+    kind = ros_type(chunks[10])
+    if kind is None:
+        return None
+    name = chunks[9].replace(_SLASH_OF_RMW, "/")
+    return Announced(int(chunks[1]), chunks[5], chunks[8], name, kind, chunks[11])
 
 
 Wire = Ros2Dds | RmwZenoh
