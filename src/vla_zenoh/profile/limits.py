@@ -7,7 +7,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from vla_zenoh.profile.section import Fault, Name, Range, Section, Vector3
+from vla_zenoh.profile.section import (
+    REACH_M,
+    Angle,
+    Fault,
+    Name,
+    Point,
+    Range,
+    Section,
+    Vector3,
+)
 
 
 def _one_for_all(value: Any) -> Any:
@@ -64,8 +73,6 @@ class JointLimits(Section):
         return values * joints if len(values) == 1 else values
 
 
-REACH_M = 3.0
-"""No table-top arm reaches further: a larger workspace is in other units."""
 REJECT_FACTOR = 4.0
 """A step this many times over its limit has the wrong unit, and is rejected."""
 
@@ -113,8 +120,6 @@ class RotationLimits(Section):
 
 
 Edge = Annotated[float, Field(gt=0, le=2 * REACH_M)]
-Coordinate = Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
-Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 LinkPair = Annotated[tuple[str, str], Field(strict=False)]
 LinkPairs = Annotated[tuple[LinkPair, ...], Field(strict=False, max_length=64)]
 Edges = Annotated[tuple[Edge, Edge, Edge], Field(strict=False)]
@@ -135,7 +140,7 @@ class KeepOut(Section):
 
     centre_m: Point
     box_m: Edges | None = None
-    yaw_rad: float = Field(default=0.0, ge=-6.3, le=6.3)
+    yaw_rad: Angle = 0.0
     radius_m: float | None = Field(default=None, gt=0, le=REACH_M)
     normal: Vector3 | None = None
 

@@ -12,7 +12,17 @@ from pydantic import AfterValidator, Field
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import NODE_KINDS
 from vla_zenoh.profile.schema import Endpoints
-from vla_zenoh.profile.section import Fault, Name, Range, Section, Text, Vector3, Word, Words
+from vla_zenoh.profile.section import (
+    Angle,
+    Fault,
+    Name,
+    Point,
+    Range,
+    Section,
+    Text,
+    Word,
+    Words,
+)
 
 MAX_JOINTS = 16
 """Joints that an arm has at most."""
@@ -162,6 +172,10 @@ class RobotProfile(Section):
         for index, angle in enumerate(self.home_rad):
             if abs(angle) > 2 * math.pi:
                 yield ("home_rad", str(index)), f"is {angle:g}: more than a turn; give radians"
+        for index, ends in enumerate(self.joint_range_rad):
+            if max(map(abs, ends)) > 4 * math.pi:
+                why = f"is {ends[0]:g} to {ends[1]:g}: more than two turns; give radians"
+                yield ("joint_range_rad", str(index)), why
         for name in sorted(set(self.arm_joints) & self.locked_rad.keys()):
             yield ("locked_rad", name), "is in arm_joints, too: it cannot stand still and move"
         if shared := sorted(set(self.arm_joints) & set(self.finger_joints)):
@@ -183,8 +197,8 @@ class PartBase(Section):
         yaw_rad: its turn about the vertical.
     """
 
-    position_m: Vector3 = (0.0, 0.0, 0.0)
-    yaw_rad: float = Field(default=0.0, ge=-6.3, le=6.3)
+    position_m: Point = (0.0, 0.0, 0.0)
+    yaw_rad: Angle = 0.0
 
 
 def _option(value: str) -> str:

@@ -13,14 +13,15 @@ from vla_zenoh import plugins
 from vla_zenoh.errors import PluginError, nearest
 from vla_zenoh.plugins import CameraPlugin
 from vla_zenoh.profile.section import (
+    Angles,
     Distinct,
     Fault,
     Name,
     Names,
     Place,
+    Point,
     Section,
     Text,
-    Vector3,
     Word,
 )
 from vla_zenoh.types import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
@@ -404,8 +405,8 @@ class CameraMount(Section):
 
     frame: Word
     link: Word
-    position_m: Vector3
-    rpy_rad: Vector3
+    position_m: Point
+    rpy_rad: Angles
 
     def contradictions(self) -> Iterator[Fault]:
         if self.frame.startswith("/"):

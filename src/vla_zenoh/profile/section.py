@@ -77,6 +77,13 @@ Names = Annotated[tuple[Name, ...], Field(strict=False, max_length=128), AfterVa
 Words = Annotated[tuple[Word, ...], Field(strict=False, max_length=64), AfterValidator(_differ)]
 Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_ordered)]
 Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
+REACH_M = 3.0
+"""No table-top arm reaches further: larger lengths are in other units."""
+Coordinate = Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
+Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
+"""A turn to either side at most: more is in degrees."""
+Angles = Annotated[tuple[Angle, Angle, Angle], Field(strict=False)]
 Distinct = AfterValidator(_differ)
 
 REPLACED_WHOLE = {("hosts",)}

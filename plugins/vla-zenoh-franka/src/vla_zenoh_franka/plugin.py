@@ -10,7 +10,7 @@ from pydantic import Field
 from vla_zenoh.plugins import RobotPlugin
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import Address
-from vla_zenoh.profile.section import Section, Vector3
+from vla_zenoh.profile.section import Point, Section
 
 if TYPE_CHECKING:
     from vla_zenoh.lab.doctor import HostFinding
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 Stiffness = Annotated[float, Field(gt=0, le=3000)]
 Threshold = Annotated[float, Field(gt=0, le=100)]
+Inertia = Annotated[float, Field(ge=-1, le=1)]
+"""7 kg at 0.3 m have 0.6 kg m^2: more is in other units."""
 _SEVEN = Field(strict=False, min_length=7, max_length=7)
 Stiffnesses = Annotated[tuple[Stiffness, ...], _SEVEN]
 Thresholds = Annotated[tuple[Threshold, ...], _SEVEN]
@@ -33,8 +35,8 @@ class FrankaLoad(Section):
     """
 
     mass_kg: float = Field(default=0.0, ge=0, le=7)
-    centre_m: Vector3 = (0.0, 0.0, 0.0)
-    inertia_kg_m2: tuple[float, float, float, float, float, float] = Field(
+    centre_m: Point = (0.0, 0.0, 0.0)
+    inertia_kg_m2: tuple[Inertia, Inertia, Inertia, Inertia, Inertia, Inertia] = Field(
         default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), strict=False
     )
 

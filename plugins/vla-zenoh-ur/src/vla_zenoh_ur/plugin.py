@@ -10,7 +10,7 @@ from pydantic import Field
 from vla_zenoh.plugins import RobotPlugin
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import Address
-from vla_zenoh.profile.section import Section, Vector3
+from vla_zenoh.profile.section import Angles, Point, Section
 
 if TYPE_CHECKING:
     from vla_zenoh.lab.doctor import HostFinding
@@ -34,10 +34,10 @@ class UrOptions(Section):
     address: Address
     lookahead_s: float = Field(default=0.1, ge=0.03, le=0.2)
     gain: float = Field(default=300.0, ge=100, le=2000)
-    tcp_m: Vector3 = (0.0, 0.0, 0.0)
-    tcp_rotvec: Vector3 = (0.0, 0.0, 0.0)
+    tcp_m: Point = (0.0, 0.0, 0.0)
+    tcp_rotvec: Angles = (0.0, 0.0, 0.0)
     payload_kg: float = Field(default=0.0, ge=0, le=50)
-    payload_centre_m: Vector3 = (0.0, 0.0, 0.0)
+    payload_centre_m: Point = (0.0, 0.0, 0.0)
     watchdog_hz: float = Field(default=5.0, ge=1, le=50)
 
 
