@@ -1,10 +1,13 @@
-"""Entry of ``vla-zenoh``: the priority of a stop, and errors as one line."""
+"""Entry of ``vla-zenoh``: the priority of a stop, its output, and errors as one line."""
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import sys
 from contextlib import suppress
+from typing import Any
 
 from vla_zenoh.cli.silence import silence
 
@@ -17,6 +20,17 @@ EXTRA_OF = {
 HASTE = -20
 """Niceness of a stop."""
 QUIET_OPTIONS = {"--help", "--wait-key"}
+UNHINDERED = ("stop", "up")
+"""Commands that an output which cannot be written must not end: a full disk, a reader that left."""
+
+
+class _Lossy(io.FileIO):
+    """An output that loses what cannot be written."""
+
+    def write(self, text: Any) -> int:
+        with suppress(OSError):
+            return super().write(text)
+        return len(text)
 
 
 def main() -> None:
@@ -24,6 +38,7 @@ def main() -> None:
 
     Under a supervisor every error becomes one line for it, and the traceback lines for its log.
     """
+    _open_outputs()
     if sys.argv[1:2] == ["stop"]:  # runs before other programs, where permitted
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, HASTE)
@@ -46,6 +61,9 @@ def main() -> None:
         from vla_zenoh.runtime.process import PARENT_VARIABLE
 
         sentence = _sentence(error)
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC and not error.filename:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sentence = f"the output cannot be written: {error.strerror}"
         if PARENT_VARIABLE in os.environ:
             _tell_supervisor(error, sentence)
             sys.exit(1)
@@ -54,6 +72,18 @@ def main() -> None:
         from vla_zenoh.cli.plain import fail
 
         fail(sentence)
+
+
+def _open_outputs() -> None:
+    """Outputs in place of closed ones, whose numbers the next file or socket would get."""
+    while (number := os.open(os.devnull, os.O_RDWR)) < 3:
+        pass
+    os.close(number)
+    made = _Lossy if sys.argv[1:2] and sys.argv[1] in UNHINDERED else io.FileIO
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if made is _Lossy or getattr(sys, name) is None:
+            buffer = io.BufferedWriter(made(number, "w", closefd=False))
+            setattr(sys, name, io.TextIOWrapper(buffer, "utf-8", "replace", line_buffering=True))
 
 
 def _sentence(error: Exception) -> str | None:

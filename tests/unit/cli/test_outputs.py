@@ -1,0 +1,74 @@
+"""Outputs that cannot be written: a full disk, a reader that left, a closed stdout."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+STOP_S = 2.5
+"""Beyond the first word of a stop, and short of the 10 s for which it goes on."""
+NOWHERE = "tcp/127.0.0.1:9"
+
+
+@contextmanager
+def full_disk() -> Iterator[int]:
+    number = os.open("/dev/full", os.O_WRONLY)
+    yield number
+    os.close(number)
+
+
+@contextmanager
+def no_reader() -> Iterator[int]:
+    reader, writer = os.pipe()
+    os.close(reader)
+    yield writer
+    os.close(writer)
+
+
+@contextmanager
+def closed() -> Iterator[None]:
+    yield None
+
+
+OUTPUTS = {"full disk": full_disk, "no reader": no_reader, "closed": closed}
+by_output = pytest.mark.parametrize("output", OUTPUTS)
+
+
+def start(output: str, *words: str) -> subprocess.Popen[str]:
+    """``vla-zenoh`` whose stdout is such an output, and whose stderr is read."""
+    close = (lambda: os.close(1)) if output == "closed" else None
+    with OUTPUTS[output]() as number:
+        return subprocess.Popen(
+            [sys.executable, "-m", "vla_zenoh", *words],
+            stdout=number,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=close,
+        )
+
+
+@by_output
+def test_a_stop_goes_on_whatever_becomes_of_its_output(output: str) -> None:
+    process = start(output, "stop", "--profile", "panda_sim", "--connect", NOWHERE)
+    try:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.communicate(timeout=STOP_S)
+    finally:
+        process.kill()
+        _, said = process.communicate()
+    assert not said
+
+
+@by_output
+@pytest.mark.parametrize("words", ["--version", "--help", "profile show panda_sim"])
+def test_other_commands_say_it_in_one_line_at_most(output: str, words: str) -> None:
+    process = start(output, *words.split())
+    _, said = process.communicate(timeout=20)
+    assert process.returncode == (output != "closed")
+    full = "error: the output cannot be written: No space left on device\n"
+    assert said == (full if output == "full disk" else "")
