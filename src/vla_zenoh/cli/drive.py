@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 from collections.abc import Callable
@@ -23,10 +22,8 @@ if TYPE_CHECKING:
     from vla_zenoh.types import Task
 
 PATIENCE_S = 3.0
-DISCOVERY_S, POLL_S = 1.0, 0.05
-"""A router's first answers may lack robots that are alive: `stop --all` asks for this long."""
+POLL_S = 0.05
 MODE_PATIENCE_S = 1.0
-LEAVING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 
 
 def _answered(command: Callable[..., None]) -> Callable[..., None]:
@@ -272,11 +269,10 @@ def _fail(target: RobotTarget, client: Client, command: str, what: str) -> NoRet
     """Exit with the reason why the command node did not do `what`."""
     if why := target.not_operator(client.profile, command):
         fail(f"{target.named(client)} does not {what}: {why}")
+    then = f". {OWN_STOP}" if command == "deactivate" else ""
     if "command" not in client.alive:
-        then = f". {OWN_STOP}" if command == "deactivate" else ""
         fail(f"{target.no_node(client, command, kind='command node')}{then}")
     see = target.typed("status")
-    then = f". {OWN_STOP}" if command == "deactivate" else ""
     fail(f"the command node of {target.named(client)} does not {what}; see `{see}`{then}")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -24,17 +24,14 @@ from vla_zenoh.errors import PluginError, ProfileError, describe_fault
 from vla_zenoh.keys import NODE_KINDS, NOT_PARTS, PRIMITIVES, Keys, worker_node
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import (
-    JOINT_COMMANDS,
     Options,
     PartBase,
     RobotProfile,
     Ros2Camera,
-    Ros2Gripper,
     Ros2Profile,
 )
 from vla_zenoh.profile.schema import (
     SIMULATED,
-    TRUSTED_PROTOCOLS,
     CameraProfile,
     Composition,
     HostProfile,
@@ -43,7 +40,6 @@ from vla_zenoh.profile.schema import (
     TaskProfile,
     Timing,
     endpoint_faults,
-    is_loopback,
 )
 from vla_zenoh.profile.section import (
     Fault,
@@ -232,7 +228,7 @@ class Profile(Section):
 
     def contradictions(self) -> Iterator[Fault]:
         """Sections that do not go together."""
-        for check in (_robot, _parts, _cameras, _ros2):
+        for check in (_robot, _parts, _cameras, _beside):
             yield from check(self)
         yield from unlisted(("task", "worker"), [self.task.worker], "workers", self.workers)
         yield from _serves(self)
@@ -394,7 +390,6 @@ def _parts(profile: Profile) -> Iterator[Fault]:
             "must be joint: the robot has parts, whose distance is only known where their joints "
             "are commanded",
         )
-    seen: dict[str, Profile] = {}
     for name, part in profile.parts.items():
         if name in NOT_PARTS:
             taken = ", ".join(sorted(NOT_PARTS))
@@ -416,30 +411,6 @@ def _parts(profile: Profile) -> Iterator[Fault]:
         else:
             own = profile.of_part(name)
             yield from _joint_limits(("parts", name), own.robot, own.limits)
-            if own.ros2 is not None and profile.robot.driver == "ros2":
-                yield from _ros2_arm(("parts", name), own.ros2, own.robot)
-                yield from _shared(name, own, seen)
-                seen[name] = own
-
-
-def _shared(name: str, own: Profile, others: Mapping[str, Profile]) -> Iterator[Fault]:
-    """What would move two arms by one command, or take one arm for another."""
-    assert own.ros2 is not None
-    for other, profile in others.items():
-        theirs = profile.ros2
-        assert theirs is not None
-        for what in ("joint_command", "gripper"):
-            ours, same = getattr(own.ros2, what), getattr(theirs, what)
-            if ours is not None and same is not None and ours.topic == same.topic:
-                why = f"has the topic of part {other}, {ours.topic}: both would follow one command"
-                yield ("parts", name, "ros2", what), why
-        joints = set(own.robot.arm_joints) & set(profile.robot.arm_joints)
-        if joints and own.ros2.joint_states == theirs.joint_states:
-            why = (
-                f"is {theirs.joint_states}, as that of part {other}, and both arms have joints "
-                f"{', '.join(sorted(joints)[:3])}: give each its own topic, or its own joint names"
-            )
-            yield ("parts", name, "ros2", "joint_states"), why
 
 
 def _cameras(profile: Profile) -> Iterator[Fault]:
@@ -457,82 +428,12 @@ def _cameras(profile: Profile) -> Iterator[Fault]:
             )
 
 
-def _ros2(profile: Profile) -> Iterator[Fault]:
-    ros2 = profile.ros2
-    if ros2 is None:
-        return
-    if not profile.parts:
-        yield from _ros2_arm((), ros2, profile.robot)
-    yield from unlisted(("ros2", "cameras"), ros2.cameras, "cameras", profile.cameras)
-    for name, camera in ros2.cameras.items():
-        source = profile.cameras[name].source if name in profile.cameras else ""
-        if source.startswith("ros2:") and source.removeprefix("ros2:") != camera.topic:
-            yield ("ros2", "cameras", name, "topic"), f"is not that of cameras.{name}: {source!r}"
-    for name, camera in profile.ros2_cameras().items():
-        if (camera.depth is None) != (profile.cameras[name].depth_unit_m is None):
-            why = f"goes with cameras.{name}.depth_unit_m, and either is given without the other"
-            yield ("ros2", "cameras", name, "depth"), why
-    yield from _way_to_ros2(profile, ros2.connect)
-
-
-def _ros2_arm(place: Place, ros2: Ros2Profile, robot: RobotProfile) -> Iterator[Fault]:
-    """Commands of an arm and its gripper."""
-    place = (*place, "ros2")
-    wanted = f"{robot.command}_command"
-    if robot.driver == "ros2" and getattr(ros2, wanted) is None:
-        yield place, f"lacks {wanted}: robot.command is {robot.command}"
-    joints = ros2.joint_command
-    if joints is not None and joints.type not in JOINT_COMMANDS:
-        wanted = " or ".join(JOINT_COMMANDS)
-        yield (*place, "joint_command", "type"), f"is {joints.type}: joints are sent as {wanted}"
-    gripper = ros2.gripper
-    if gripper is not None:
-        if gripper.grasp and gripper.type != "franka_msgs/action/Move":
-            yield (*place, "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
-        if robot.gripper is None:
-            width = "gripper: {max_width_m: ...}, its largest opening"
-            yield (*place, "gripper"), f"needs robot.gripper: {width}"
-            return
-        yield from _gripper_position(place, gripper, robot.gripper.joint_ends is not None)
-        if gripper.type == JOINT_COMMANDS[0] and not robot.finger_joints:
-            yield (*place, "gripper", "type"), "is a trajectory, which needs robot.finger_joints"
-
-
-def _gripper_position(place: Place, gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:
-    """A number with the wrong meaning opens the gripper where it should close."""
-    place = (*place, "gripper", "position")
-    ends = "joint_open_rad and joint_shut_rad (_m where it slides) in robot.gripper"
-    if gripper.says_width and gripper.position is not None:
-        yield place, f"is not for {gripper.type}, which takes the width"
-    elif gripper.position == "joint" and not has_ends:
-        yield place, f"is joint, which needs {ends}"
-    elif not (gripper.says_width or gripper.position or has_ends):
-        yield (
-            place,
-            f"is missing: does the driver take the m between the fingers (width), those of one "
-            f"finger (finger), or what its joint goes by (joint, with {ends})?",
-        )
-
-
-def _way_to_ros2(profile: Profile, places: Sequence[str] | None) -> Iterator[Fault]:
-    """A client of the bridge can move the robot without our command node."""
-    secured = profile.session.security is not None
-    used = any("ros2" in host.nodes for host in profile.hosts.values())
-    if places is None and secured and used:
-        yield (
-            ("ros2", "connect"),
-            "is missing: in a secured lab the bridge has a router of its own. On the computer that "
-            "runs the node ros2: connect: [tcp/127.0.0.1:7450]; on another one, where it takes "
-            "this lab's certificates: connect: [tls/ADDRESS:7450]",
-        )
-    trusted = [endpoint.partition("/")[0] in TRUSTED_PROTOCOLS for endpoint in places or ()]
-    for index, endpoint in enumerate(places or ()):
-        place = ("ros2", "connect", str(index))
-        if trusted[index] and not secured:
-            yield place, "needs certificates: make them with `vla-zenoh secure init`"
-        elif secured and not trusted[index] and (any(trusted) or not is_loopback(endpoint)):
-            why = "lets anyone on the network command the robot: write tls/, or tcp/127.0.0.1:7450"
-            yield place, why
+def _beside(profile: Profile) -> Iterator[Fault]:
+    """What the plug-in finds that serves ROS 2 beside a robot of another driver."""
+    others = profile.robot_nodes.keys() - {profile.robot.driver}
+    for name in others & plugins.installed(plugins.ROBOTS).keys():
+        robot = plugins.load(plugins.ROBOTS, name)
+        yield from plugins.faults_of(name, robot.contradictions, profile, None)
 
 
 def _serves(profile: Profile) -> Iterator[Fault]:

@@ -233,7 +233,6 @@ def _type(value: str) -> str:
 Topic = Annotated[str, Field(max_length=256), AfterValidator(_topic)]
 RosType = Annotated[str, Field(max_length=256), AfterValidator(_type)]
 
-JOINT_COMMANDS = ("trajectory_msgs/msg/JointTrajectory", "std_msgs/msg/Float64MultiArray")
 GripperAction = Literal[
     "franka_msgs/action/Move",
     "franka_msgs/action/Grasp",
@@ -287,7 +286,7 @@ class Ros2Output(Section):
         topic: its name.
         type: for poses geometry_msgs/msg/PoseStamped,
             multi_mode_control_msgs/msg/CartesianImpedanceGoal, or any other type with a pose; for
-            joints one of `JOINT_COMMANDS`.
+            joints trajectory_msgs/msg/JointTrajectory or std_msgs/msg/Float64MultiArray.
         frame: frame_id of its header; None: robot.base_frame.
     """
 
@@ -329,11 +328,6 @@ class Ros2Gripper(Section):
     type: Literal[GripperAction, GripperTopic]
     grasp: Topic | None = None
     position: Literal["width", "finger", "joint"] | None = None
-
-    @property
-    def says_width(self) -> bool:
-        """Whether the type itself defines the number as the width."""
-        return self.type.startswith("franka_msgs/")
 
 
 class Ros2Profile(Section):

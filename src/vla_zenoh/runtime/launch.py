@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import secrets
 import signal
 import tempfile
 import threading
@@ -16,26 +15,23 @@ from typing import IO, Any
 
 import zenoh
 
-from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.host import HOST_VARIABLE, HostId, own_boot_id, own_host_id
-from vla_zenoh.bus.node import Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, ProfileError, SessionError, VlaZenohError
 from vla_zenoh.keys import (
     CRASHED,
     NODE_KINDS,
-    ON_BEHALF,
     OPENING,
     ROLLING,
     STARTING,
-    Kind,
     worker_node,
 )
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S, RUN_FOLDER_VARIABLE
 from vla_zenoh.runtime.router import reject_taken
+from vla_zenoh.runtime.starting import Voice
 from vla_zenoh.runtime.supervisor import (
     Child,
     NodeCommand,
@@ -458,24 +454,20 @@ class DownNodes:
         for child in down:
             name = child.command.name
             if name not in self._voices:
-                self._voices[name] = _Voice(self._profile, name, self._session)
-            self._voices[name].publish(child, self._host_id)
+                self._voices[name] = _Voice(self._profile, name, self._session, self._host_id)
+            self._voices[name].publish(child)
 
 
 class _Voice:
-    """Publishers of one node that is down."""
+    """Voice of one node that is down."""
 
-    def __init__(self, profile: Profile, name: str, session: zenoh.Session) -> None:
+    def __init__(self, profile: Profile, name: str, session: zenoh.Session, place: HostId) -> None:
         self._own: zenoh.Session | None = None
         if profile.session.security is not None:
             session = self._own = open_session(profile.session, identity=name)
-        keys, clock = profile.keys, Clock()
-        source = f"{ON_BEHALF}{name}#{secrets.token_hex(4)}"
-        self._name, self._since_wall_ns, self._crashes = name, time.time_ns(), 0
-        self._status = Publisher(session, keys.status(name), Kind.TELEMETRY, source, clock)
-        self._event = Publisher(session, keys.event(name), Kind.TELEMETRY, source, clock)
+        self._voice, self._crashes = Voice(session, profile, name, place), 0
 
-    def publish(self, child: Child, on: HostId) -> None:
+    def publish(self, child: Child) -> None:
         crashes, state, why = child.deaths_in_a_row, STARTING, ""
         if crashes:
             state = CRASHED
@@ -486,16 +478,12 @@ class _Voice:
             end = child.end.encode("utf-8", "replace").decode()[:MAX_WHY]
             why = f"crashed {times}: {end}; {then}"
         if crashes > self._crashes:
-            self._event.publish(Event("error", "fault", CRASHED, why))
+            self._voice.emit(Event("error", "fault", CRASHED, why))
         self._crashes = crashes
-        detail = {"complaint": why, "crashes": crashes, "given_up": child.left_alone}
-        status = NodeStatus(
-            self._name, state, on.host, child.pid, self._since_wall_ns, detail=detail, boot=on.boot
-        )
-        self._status.publish(status)
+        given_up = child.left_alone
+        self._voice.say(state, child.pid, complaint=why, crashes=crashes, given_up=given_up)
 
     def close(self) -> None:
-        self._status.undeclare()
-        self._event.undeclare()
+        self._voice.close()
         if self._own is not None:
             self._own.close()

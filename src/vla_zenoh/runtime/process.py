@@ -37,8 +37,6 @@ LOOP_PRIORITY, LINK_PRIORITY = 40, 30
 """SCHED_FIFO priorities: no link thread may preempt a control loop."""
 INNER_PRIORITY = 45
 """Of a robot's own loop inside a driver library, which is faster than ours."""
-TASKS = Path("/proc/self/task")
-"""Threads of this process; empty where this is not Linux."""
 NICENESS = -10
 SET_TIMER_SLACK, GET_TIMER_SLACK = 29, 30  # PR_SET_TIMERSLACK and PR_GET_TIMERSLACK of prctl(2)
 
@@ -178,21 +176,6 @@ def realtime_thread() -> Iterator[bool]:
             yield granted
     finally:
         prctl(SET_TIMER_SLACK, slack_ns)
-
-
-@contextmanager
-def realtime_children() -> Iterator[None]:
-    """SCHED_FIFO for the threads that a library starts in this context.
-
-    They inherit nothing from a `realtime_thread`.
-    """
-    before = set(TASKS.glob("*"))
-    yield
-    for task in set(TASKS.glob("*")) - before:
-        try:
-            os.sched_setscheduler(int(task.name), os.SCHED_FIFO, os.sched_param(INNER_PRIORITY))
-        except OSError:  # not permitted, or already over
-            return
 
 
 @contextmanager

@@ -8,11 +8,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
+from typing import Any
 
 import zenoh
 
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.host import own_host_id
+from vla_zenoh.bus.host import HostId, own_host_id
 from vla_zenoh.bus.node import Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import VlaZenohError, in_words
@@ -20,11 +22,9 @@ from vla_zenoh.keys import CRASHED, ON_BEHALF, STARTING, Kind
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.process import PARENT_VARIABLE
 from vla_zenoh.sanitize import one_line
-from vla_zenoh.types import NodeStatus
+from vla_zenoh.types import Event, NodeStatus
 
 PERIOD_S = 0.5
-
-
 MAX_WHY = 1000
 UNHEARD = (VlaZenohError, zenoh.ZError)
 """Without a router nobody hears it."""
@@ -37,9 +37,9 @@ def shown_as_starting(profile: Profile, name: str, host: str | None) -> Iterator
 
     def publish() -> None:
         with suppress(*UNHEARD), _status_of(profile, name, host) as say:
-            say(STARTING, "")
+            say(STARTING)
             while not ended.wait(PERIOD_S):
-                say(STARTING, "")
+                say(STARTING)
 
     thread = threading.Thread(target=publish, daemon=True)
     if PARENT_VARIABLE not in os.environ:
@@ -60,26 +60,40 @@ def shown_as_crashed(profile: Profile, name: str, host: str | None) -> Iterator[
     except Exception as error:
         if PARENT_VARIABLE not in os.environ:
             with suppress(*UNHEARD), _status_of(profile, name, host) as say:
-                say(CRASHED, one_line(in_words(error), MAX_WHY))
+                say(CRASHED, complaint=one_line(in_words(error), MAX_WHY))
         raise
 
 
+class Voice:
+    """Says what is known of a node that cannot speak itself, in its name and on its keys."""
+
+    def __init__(self, session: zenoh.Session, profile: Profile, name: str, place: HostId) -> None:
+        source, clock = f"{ON_BEHALF}{name}#{secrets.token_hex(4)}", Clock()
+        self._name, self._place, self._since_ns = name, place, time.time_ns()
+        self._status, self._event = (
+            Publisher(session, key, Kind.TELEMETRY, source, clock)
+            for key in (profile.keys.status(name), profile.keys.event(name))
+        )
+
+    def say(self, state: str, pid: int, **detail: Any) -> None:
+        """Publish a status."""
+        place = self._place
+        status = NodeStatus(
+            self._name, state, place.host, pid, self._since_ns, detail=detail, boot=place.boot
+        )
+        self._status.publish(status)
+
+    def emit(self, event: Event) -> None:
+        self._event.publish(event)
+
+    def close(self) -> None:
+        self._status.undeclare()
+        self._event.undeclare()
+
+
 @contextmanager
-def _status_of(
-    profile: Profile, name: str, host: str | None
-) -> Iterator[Callable[[str, str], None]]:
-    """Publishes a state with its reason in the node's name."""
-    place, since_ns = own_host_id(profile.session, host), time.time_ns()
-    source = f"{ON_BEHALF}{name}#{secrets.token_hex(4)}"
+def _status_of(profile: Profile, name: str, host: str | None) -> Iterator[Callable[..., None]]:
+    """Publishes a state, with what else is given, in the node's name."""
     with open_session(profile.session, identity=name) as session:
-        status = Publisher(session, profile.keys.status(name), Kind.TELEMETRY, source, Clock())
-
-        def say(state: str, why: str) -> None:
-            detail = {"complaint": why} if why else {}
-            status.publish(
-                NodeStatus(
-                    name, state, place.host, os.getpid(), since_ns, detail=detail, boot=place.boot
-                )
-            )
-
-        yield say
+        voice = Voice(session, profile, name, own_host_id(profile.session, host))
+        yield partial(voice.say, pid=os.getpid())

@@ -182,63 +182,50 @@ SETTING: Allowed = {
     Act.ASK: LOOKERS,
 }
 """Published by the operator, received by the command node, visible to viewers."""
-NEWS: Allowed = {Act.PUT: SPEAKERS, Act.SUBSCRIBE: {COMMAND} | LOOKERS}
 
 
-def _stream(writers: set[Role], readers: set[Role]) -> Allowed:
-    return {Act.PUT: writers | {REPLAY}, Act.SUBSCRIBE: readers}
+def _streams(names: str, writers: Set[Role], readers: Set[Role]) -> dict[str, Allowed]:
+    """The same rights on several members."""
+    return {key: {Act.PUT: writers | {REPLAY}, Act.SUBSCRIBE: readers} for key in names.split()}
 
 
 TABLE: Mapping[str, Allowed] = {
     # Images show people, so a viewer does not see them.
-    "camera_raw": _stream({CAMERA, ROBOT}, {WORKER, OPERATOR}),
-    "camera_jpeg": _stream({CAMERA, ROBOT}, {WORKER, OPERATOR}),
-    "camera_depth": _stream({CAMERA, ROBOT}, {WORKER, OPERATOR}),
-    "camera_fitted": _stream({CAMERA, ROBOT}, {WORKER, OPERATOR}),
-    "seen": _stream({WORKER}, {OPERATOR}),
-    "seen_depth": _stream({WORKER}, {OPERATOR}),
-    "seen_record": _stream({WORKER}, {OPERATOR}),
-    "state_joint": _stream({ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
-    "state_pose": _stream({ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
-    "state_gripper": _stream({ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
-    "state_privileged": _stream({ROBOT}, {WORKER, OPERATOR, VIEWER}),
-    "prompt": SETTING,
-    "active": SETTING,
+    **_streams(
+        "camera_raw camera_jpeg camera_depth camera_fitted", {CAMERA, ROBOT}, {WORKER, OPERATOR}
+    ),
+    **_streams("seen seen_depth seen_record", {WORKER}, {OPERATOR}),
+    **_streams("state_joint state_pose state_gripper", {ROBOT}, {WORKER, COMMAND} | LOOKERS),
+    **_streams("state_privileged", {ROBOT}, {WORKER} | LOOKERS),
+    **dict.fromkeys(("prompt", "active", "worker", "rate", "speed"), SETTING),
     "holding": {Act.ANNOUNCE: {OPERATOR}, Act.WATCH: {COMMAND}},
-    "worker": SETTING,
-    "rate": SETTING,
-    "speed": SETTING,
     # Every role that may stop the arm may slow it down.
-    "slower": _stream({OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
-    "held": _stream({OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
-    "stop": _stream({OPERATOR}, {COMMAND, ROBOT, OPERATOR, VIEWER}),
-    "reset": _stream({OPERATOR}, {COMMAND, ROBOT, OPERATOR, VIEWER}),
-    "save": _stream({OPERATOR}, {OPERATOR, VIEWER}),
+    **_streams("slower held", {OPERATOR}, {COMMAND} | LOOKERS),
+    **_streams("stop reset", {OPERATOR}, {COMMAND, ROBOT} | LOOKERS),
+    **_streams("save", {OPERATOR}, LOOKERS),
     "task": {
         Act.PUT: {COMMAND, REPLAY},
         Act.SUBSCRIBE: {ROBOT, WORKER} | LOOKERS,
         Act.ANSWER: {COMMAND},
         Act.ASK: {WORKER} | LOOKERS,
     },
-    "delta": _stream({WORKER}, {COMMAND, OPERATOR, VIEWER}),
+    **_streams("delta", {WORKER}, {COMMAND} | LOOKERS),
     "spec": {
         Act.PUT: {WORKER, REPLAY},
-        Act.SUBSCRIBE: {CAMERA, COMMAND, OPERATOR, VIEWER},
+        Act.SUBSCRIBE: {CAMERA, COMMAND} | LOOKERS,
         Act.ANSWER: {WORKER},
-        Act.ASK: {COMMAND, OPERATOR, VIEWER},
+        Act.ASK: {COMMAND} | LOOKERS,
     },
-    "command_pose": _stream({COMMAND}, {ROBOT, OPERATOR, VIEWER}),
-    "command_joint": _stream({COMMAND}, {ROBOT, OPERATOR, VIEWER}),
-    "command_gripper": _stream({COMMAND}, {ROBOT, OPERATOR, VIEWER}),
+    **_streams("command_pose command_joint command_gripper", {COMMAND}, {ROBOT} | LOOKERS),
     "primitive": {Act.ANSWER: {WORKER}, Act.ASK: {OPERATOR}},
     # A worker compares what it receives with what the senders say they sent.
     "status": {Act.PUT: SPEAKERS, Act.SUBSCRIBE: {COMMAND, WORKER} | LOOKERS},
-    "event": NEWS,
+    "event": {Act.PUT: SPEAKERS, Act.SUBSCRIBE: {COMMAND} | LOOKERS},
     "alive": {Act.ANNOUNCE: SPEAKERS, Act.WATCH: NODES | LOOKERS | {REPLAY}},
     "clock": {Act.ANSWER: SPEAKERS, Act.ASK: NODES | LOOKERS | {REPLAY}},
-    "sim_scene": _stream({ROBOT}, {CAMERA, OPERATOR}),
-    "sim_objects": _stream({ROBOT}, {OPERATOR, VIEWER}),
-    "sim_reset": _stream({OPERATOR}, {ROBOT, OPERATOR}),
+    **_streams("sim_scene", {ROBOT}, {CAMERA, OPERATOR}),
+    **_streams("sim_objects", {ROBOT}, LOOKERS),
+    **_streams("sim_reset", {OPERATOR}, {ROBOT, OPERATOR}),
     "sim_step": {Act.ANSWER: {ROBOT}, Act.ASK: {OPERATOR}},
 }
 

@@ -12,7 +12,12 @@ import yaml
 import zenoh
 from access_check import Passage, allows, passages
 from typer.testing import CliRunner
-from vla_zenoh_ros2.bridge_config import bridge_command, bridge_config, bridge_text
+from vla_zenoh_ros2.bridge_config import (
+    bridge_command,
+    bridge_config,
+    bridge_locks,
+    bridge_text,
+)
 from vla_zenoh_ros2.keys import Ros2Dds
 from vla_zenoh_secure.lab_certificates import LabCertificates
 
@@ -20,7 +25,7 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.program.main import app
 from vla_zenoh.security import certificates
-from vla_zenoh.security.bridge import bridge_locks, bridges
+from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.names import Names
 from vla_zenoh.security.roles import Act, Role
 

@@ -9,13 +9,15 @@ controller holds the arm where it stands.
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +27,7 @@ from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Command, Reading
-from vla_zenoh.runtime.process import realtime_children
+from vla_zenoh.runtime.process import INNER_PRIORITY
 from vla_zenoh.types import FloatArray, JointCommand
 from vla_zenoh_franka.hand import Hand
 from vla_zenoh_franka.plugin import FrankaOptions
@@ -60,6 +62,25 @@ MOST_M, MOST_RAD, MOST_JOINT_RAD = 0.008, 0.03, 0.008
 READY = frozenset({"Idle", "Move"})
 STOPPED = frozenset({"Reflex", "UserStopped"})
 """Robot modes that are a fault. In the others the robot is healthy but follows no commands."""
+
+
+TASKS = Path("/proc/self/task")
+"""Threads of this process."""
+
+
+@contextmanager
+def realtime_children() -> Iterator[None]:
+    """SCHED_FIFO for the threads that a library starts in this context.
+
+    They inherit nothing from a `realtime_thread`.
+    """
+    before = set(TASKS.glob("*"))
+    yield
+    for task in set(TASKS.glob("*")) - before:
+        try:
+            os.sched_setscheduler(int(task.name), os.SCHED_FIFO, os.sched_param(INNER_PRIORITY))
+        except OSError:  # not permitted, or already over
+            return
 
 
 class FrankaArm:

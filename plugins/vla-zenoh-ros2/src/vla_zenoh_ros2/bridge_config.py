@@ -6,12 +6,17 @@ import ipaddress
 import json
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS, endpoint_faults, host_of, is_loopback
+from vla_zenoh.security.bridge import NODE, USER
+from vla_zenoh.security.names import Names
+from vla_zenoh.security.roles import EVERY_MESSAGE, IN, OUT, rule
+from vla_zenoh.security.store import AUTHORITY
 from vla_zenoh_ros2.keys import (
     ANSWER_TOPIC,
     LOG,
@@ -91,6 +96,40 @@ def bridge_config(
                 "reliable_routes_blocking": False,
                 "allow": _allowed(profile),
             }
+        },
+    }
+
+
+KEYS = ("**", "**/@adv/**", "@/*/@ros2_lv/**", "@/*/ros2/**")
+"""Topics and services, what late listeners ask for, what bridges tell each other, and what they say
+of DDS. A star stands for no name that begins with an @."""
+
+
+def bridge_locks(profile: Profile, folder: Path, names: Names) -> dict[str, Any]:
+    """Zenoh's sections ``transport`` and ``access_control`` for the bridge.
+
+    On its computer `folder` has ``ca.pem``, ``bridge.pem`` and ``bridge.key``.
+    """
+    hosts = [name for name, part in profile.hosts.items() if USER in part.nodes]
+    users = [names.current(f"{USER}@{host}") for host in hosts]
+    return {
+        "transport": {
+            "link": {
+                "tls": {
+                    "root_ca_certificate": str(folder / f"{AUTHORITY}.pem"),
+                    "listen_certificate": str(folder / f"{NODE}.pem"),
+                    "listen_private_key": str(folder / f"{NODE}.key"),
+                    "enable_mtls": True,
+                    "close_link_on_expiration": True,
+                }
+            }
+        },
+        "access_control": {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": [rule(USER, (IN, OUT), EVERY_MESSAGE, KEYS)],
+            "subjects": [{"id": USER, "cert_common_names": users}],
+            "policies": [{"rules": [USER], "subjects": [USER]}],
         },
     }
 

@@ -63,9 +63,10 @@ def bridge_config(
 
 def _locks(profile: Profile, given: Path | None) -> tuple[dict[str, object], str]:
     """The bridge's sections for certificates and access, and how to copy the certificates."""
-    from vla_zenoh.security.bridge import NODE, bridge_locks, bridges
+    from vla_zenoh.security.bridge import NODE, bridges
     from vla_zenoh.security.names import read_names
     from vla_zenoh.security.store import Store
+    from vla_zenoh_ros2.bridge_config import bridge_locks
 
     assert profile.session.security is not None
     store, hosts = Store(profile.session.security.folder), [b.host for b in bridges(profile)]

@@ -8,6 +8,7 @@ from typing import Any
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.plugins import Fault, RobotPlugin
 from vla_zenoh.profile import Profile
+from vla_zenoh_ros2.contradictions import contradictions
 
 
 def _check(profile: Profile, options: Any) -> Iterator[Fault]:
@@ -26,4 +27,4 @@ def _check_host(profile: Profile, options: Any) -> Iterator[Any]:
     return ros2_bridge(profile)
 
 
-PLUGIN = RobotPlugin(check=_check, check_host=_check_host)
+PLUGIN = RobotPlugin(contradictions=contradictions, check=_check, check_host=_check_host)

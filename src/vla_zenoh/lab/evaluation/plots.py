@@ -65,12 +65,10 @@ def timeline(run: Evaluation) -> str:
                 col=1,
             )
     shapes = [
-        {"type": "line", "xref": "x", "yref": "paper", "x0": t_s, "x1": t_s, "y0": 0, "y1": 1}
-        | {"line": {"width": 1, "dash": "dot", "color": "#8894a0"}, "layer": "below"}
+        _upright(t_s, width=1, dash="dot", color="#8894a0") | {"layer": "below"}
         for t_s, _ in run.marks[:MAX_MARKS]
     ]
-    cursor = {"type": "line", "xref": "x", "yref": "paper", "x0": 0, "x1": 0, "y0": 0, "y1": 1}
-    shapes.append(cursor | {"line": {"width": 2, "color": "#e4572e"}})
+    shapes.append(_upright(0.0, width=2, color="#e4572e"))  # the cursor
     for note in figure.select_annotations():  # titles: above their curves, at the left
         note.update(x=0, xanchor="left", font={"size": 12})
     for number, (t_s, prompt) in enumerate(run.marks[:MAX_MARKS], 1):
@@ -80,10 +78,16 @@ def timeline(run: Evaluation) -> str:
         )  # fmt: skip
     figure.update_xaxes(title_text="time (s)", row=len(shown), col=1)
     height = TOP_PX + ROW_PX * len(shown)
-    figure.update_layout(shapes=shapes, height=height, showlegend=False, hovermode="x")
-    figure.update_layout(barmode="stack")
-    figure.update_layout(margin={"l": 48, "r": 8, "t": TOP_PX, "b": 40})
+    margin = {"l": 48, "r": 8, "t": TOP_PX, "b": 40}
+    figure.update_layout(shapes=shapes, height=height, margin=margin, barmode="stack")
+    figure.update_layout(showlegend=False, hovermode="x")
     return _json(figure)
+
+
+def _upright(t_s: float, **line: Any) -> dict[str, Any]:
+    """A line through all curves at a time."""
+    place = {"xref": "x", "yref": "paper", "x0": t_s, "x1": t_s, "y0": 0, "y1": 1}
+    return {"type": "line", "line": line, **place}
 
 
 def _title(panel: Panel) -> str:

@@ -81,18 +81,14 @@ def segment_rows(run: Evaluation) -> list[tuple[str, ...]]:
     """Prompt, steps, asked, reached along it, furthest off it, gripper."""
     rows: list[tuple[str, ...]] = []
     for found in run.segments:
-        turning = bool(found.asked_rad)
-        asked, along = (
-            (found.asked_rad, found.along_rad) if turning else (found.asked_m, found.along_m)
-        )
-        unit, digits = ("rad", 4) if turning else ("m", 4)
+        unit, reached = ("rad", found.along_rad) if found.asked_rad else ("m", found.along_m)
         width = found.width_m
         rows.append(
             (
                 found.prompt,
                 str(found.requests),
-                number(asked or None, unit, digits),
-                number(along if asked else None, unit, digits),
+                number(found.asked or None, unit, 4),
+                number(reached if found.asked else None, unit, 4),
                 number(found.drift_m, "mm", 2, 1e3),
                 number(found.drift_rad, "mrad", 2, 1e3),
                 NONE if width is None else f"{width[0] * 1e3:.1f} to {width[1] * 1e3:.1f} mm",

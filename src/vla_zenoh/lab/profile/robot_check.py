@@ -18,8 +18,10 @@ from vla_zenoh.errors import (
 )
 from vla_zenoh.profile import POSE_JOINTS, Profile
 from vla_zenoh.profile.section import Place
+from vla_zenoh.types import FloatArray
 
 if TYPE_CHECKING:
+    from vla_zenoh.control.reachability import ReachabilityFilter
     from vla_zenoh.kinematics.kinematics import Kinematics
 
 TOOL_M = 0.06
@@ -55,7 +57,6 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
     """The arm as the command node makes it."""
     place = ("robot", "description")
     try:
-        from vla_zenoh.control.limits import into_workspace
         from vla_zenoh.control.reachability import ReachabilityFilter
         from vla_zenoh.kinematics.plausibility import implausible
 
@@ -75,7 +76,7 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
     kinematics = reach.kinematics
     for why in implausible(kinematics, profile.limits, reach.barriers.collisions):
         yield ProfileFault(place, why)
-    home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
+    home_rad = _home_rad(profile, reach)
     for index, joint in enumerate(kinematics.arm_joints):
         low, high = float(kinematics.lower_rad[index]), float(kinematics.upper_rad[index])
         if not low <= home_rad[index] <= high:
@@ -84,33 +85,50 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
                 f"puts {joint} at {home_rad[index]:.3g} rad, its range is {low:.3g} to {high:.3g}",
             )
             return
-    at_m = kinematics.forward(home_rad).position_m
-    _, outside_m = into_workspace(profile.limits, at_m)
+    where, outside_m = _home_tcp(profile, reach)
     if profile.robot.driver == "sim" and outside_m > profile.limits.step_m:
-        where = ", ".join(f"{value:.3f}" for value in at_m)
         box = profile.limits.tcp_box
         yield ProfileFault(
             ("robot", "home_rad"),
-            f"puts the TCP at ({where}) m, {outside_m:.3f} m outside "
+            f"puts the TCP at {where} m, {outside_m:.3f} m outside "
             f"limits.workspace x {box.x_m} y {box.y_m} z {box.z_m}: the simulated arm starts there "
             "and could not be activated",
             other=("limits", "workspace"),
         )
 
 
+def _reach(profile: Profile) -> ReachabilityFilter | None:
+    """The arm as the command node makes it; None: it cannot, and `arm` says why."""
+    try:
+        from vla_zenoh.control.reachability import ReachabilityFilter
+
+        return ReachabilityFilter(profile)
+    except (ImportError, ValueError, VlaZenohError):
+        return None
+
+
+def _home_rad(profile: Profile, reach: ReachabilityFilter) -> FloatArray:
+    return reach.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
+
+
+def _home_tcp(profile: Profile, reach: ReachabilityFilter) -> tuple[str, float]:
+    """Where the TCP is with the arm at home, in words, and how far outside the workspace, m."""
+    from vla_zenoh.control.limits import into_workspace
+
+    at_m = reach.kinematics.forward(_home_rad(profile, reach)).position_m
+    _, outside_m = into_workspace(profile.limits, at_m)
+    return f"({', '.join(f'{value:.3f}' for value in at_m)})", outside_m
+
+
 def barriers_advice(profile: Profile) -> Iterator[str]:
     """Advice for a home that is too near to something, and for what no barrier protects."""
     for part in profile.parts or [""]:
         own = profile.of_part(part)
-        try:
-            from vla_zenoh.control.reachability import ReachabilityFilter
-
-            reach = ReachabilityFilter(own)
-        except (ImportError, ValueError, VlaZenohError):
-            continue  # `arm` says so
+        reach = _reach(own)
+        if reach is None:
+            continue
         at = f"parts.{part}." if part else ""
-        home_rad = reach.kinematics.ordered(own.robot.arm_joints, own.robot.home_rad)
-        for hit in reach.barriers.inside(home_rad):
+        for hit in reach.barriers.inside(_home_rad(own, reach)):
             yield (
                 f"{at}robot.home_rad: {hit.name}{hit.at} is "
                 f"{hit.value:.4f} m with the arm at home, and must be over {hit.limit:.4g} m: from "
@@ -143,14 +161,12 @@ def table_advice(profile: Profile) -> Iterator[str]:
 
 def joints_advice(profile: Profile) -> Iterator[str]:
     """What the check assumes of joints that are not commanded, of home, and of too few joints."""
-    try:
-        from vla_zenoh.control.limits import into_workspace
-        from vla_zenoh.control.policy_check import immovable_axes
-        from vla_zenoh.kinematics.kinematics import make_kinematics
+    reach = _reach(profile)
+    if reach is None:
+        return
+    from vla_zenoh.control.policy_check import immovable_axes
 
-        kinematics = make_kinematics(profile)
-    except (ImportError, ValueError, VlaZenohError):
-        return  # `arm` says so
+    kinematics = reach.kinematics
     for name, (joint, multiplier, offset) in kinematics.followers.items():
         yield (
             f"robot.arm_joints: {name} is not commanded; poses assume that it follows {joint}, at "
@@ -163,13 +179,10 @@ def joints_advice(profile: Profile) -> Iterator[str]:
             "believed"
         )
     yield from _fingers_advice(profile, kinematics.fingers_m)
-    home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
-    at_m = kinematics.forward(home_rad).position_m
-    _, outside_m = into_workspace(profile.limits, at_m)
+    where, outside_m = _home_tcp(profile, reach)
     if outside_m > 0 and profile.robot.driver != "sim":
-        where = ", ".join(f"{value:.3f}" for value in at_m)
         yield (
-            f"robot.home_rad: the TCP is then at ({where}) m, {outside_m:.3f} m outside "
+            f"robot.home_rad: the TCP is then at {where} m, {outside_m:.3f} m outside "
             "limits.workspace: the arm cannot be moved home. Are base_frame, tcp_frame and the "
             "units of the description right?"
         )
@@ -177,7 +190,8 @@ def joints_advice(profile: Profile) -> Iterator[str]:
     if joints >= POSE_JOINTS:
         yield from _axes_advice(kinematics)
         return
-    axes = ", ".join(immovable_axes(kinematics.jacobian(home_rad))) or "none"
+    fixed = immovable_axes(kinematics.jacobian(_home_rad(profile, reach)))
+    axes = ", ".join(fixed) or "none"
     yield (
         f"robot.arm_joints: {joints} joints cannot reach every pose, as six can. At home the TCP "
         f"cannot move along or about these axes alone: {axes}. Steps of a model along them are "
@@ -266,13 +280,9 @@ def simulator(profile: Profile) -> Iterator[ProfileFault]:
 
 
 def _not_simulated(profile: Profile, error: VlaZenohError) -> Iterator[ProfileFault]:
-    from vla_zenoh.control.reachability import ReachabilityFilter
-
-    try:
-        urdf = resources.robot_urdf(profile.robot.description)
-        ReachabilityFilter(profile)
-    except (ValueError, VlaZenohError):
-        return  # `arm` says so
+    if _reach(profile) is None:
+        return
+    urdf = resources.robot_urdf(profile.robot.description)
     yield ProfileFault(
         ("robot", "description"),
         f"the simulator (robot.driver: sim) cannot build {urdf.name}: {error}. A real arm has "

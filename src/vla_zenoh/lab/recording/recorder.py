@@ -69,7 +69,6 @@ class RecordingResult:
     path: Path
     seconds: float = 0.0
     size_bytes: int = 0
-    cpu_s: float = 0.0
     samples: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
     streams: dict[str, Share] = field(default_factory=dict)
@@ -251,7 +250,6 @@ class Recorder:
         self.recorded.seconds = time.monotonic() - self._began_s
         self.recorded.size_bytes = self._writer.size
         self.recorded.samples = self._writer.counts
-        self.recorded.cpu_s = time.thread_time()
 
     def _report(self, state: str, *, now: bool = False) -> None:
         recorded = self.recorded

@@ -6,6 +6,7 @@ libraries are imported below.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
@@ -63,9 +64,7 @@ V4L2 = CameraPlugin(
 RTSP = CameraPlugin(
     written="rtsp://HOST/PATH", make=_rtsp, check=_rtsp_fault, has_lens=True, same_moving_s=5.0
 )
-RTSPS = CameraPlugin(
-    written="rtsps://HOST/PATH", make=_rtsp, check=_rtsp_fault, has_lens=True, same_moving_s=5.0
-)
+RTSPS = replace(RTSP, written="rtsps://HOST/PATH")
 FILE = CameraPlugin(
     written="file:VIDEO_OR_FOLDER", make=_file, is_path=True, has_lens=True, same_moving_s=0.0
 )
