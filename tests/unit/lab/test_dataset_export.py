@@ -29,6 +29,7 @@ from dataset_rig import (
     steps_of,
 )
 from dataset_rig import write_run as make_run
+from made_arm import made_arm
 from typed import typed
 from vla_zenoh_dataset.episodes import episodes_of, fps_of
 from vla_zenoh_dataset.features import (
@@ -45,7 +46,7 @@ from vla_zenoh_dataset.openvla import openvla_statistics
 from vla_zenoh_dataset.videos import chosen
 from vla_zenoh_policy_servers.state_vector import read_parts
 
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import RecordingError, SpecError
 from vla_zenoh.lab.recording.run import Run, load_run, pictures
 from vla_zenoh.policy import ActionSpec, standing_step
 from vla_zenoh.profile import load_profile, override
@@ -405,6 +406,28 @@ def test_joints_that_are_no_positions_keep_our_names_and_units(tmp_path: Path) -
         assert action_names(episodes[0].spec.action) == [*JOINTS, f"gripper_{gripper}"]
 
 
+def test_a_joint_that_slides_stays_in_metres(tmp_path: Path) -> None:
+    profile = made_arm(tmp_path, "sztytz")
+    joints = profile.robot.arm_joints
+    of = spec(space="joint", joints=joints, kind="absolute", gripper="none", rotation="rotvec")
+    run = load_run(make_run(tmp_path / "lift.mcap", of=of, profile_yaml=to_yaml(profile)))
+    joint = JointState(joints, np.array([0.1, 0.2, 0.3]), np.zeros(3), None)
+    run = replace(run, joints=[heard._replace(record=joint) for heard in run.poses])
+    episodes = episodes_of(run)
+    export(tmp_path / "out", episodes, [], read_parts("joint"))
+    rows = pq.read_table(next((tmp_path / "out" / "data").rglob("*.parquet")))
+    columns = ("observation.state", "action")
+    state, action = (np.array(rows.column(name)[0].as_py()) for name in columns)
+    np.testing.assert_allclose(state, [0.1, *np.degrees([0.2, 0.3])], rtol=1e-6)
+    asked = steps_of(0, 0, 3)[0].astype(np.float64)
+    np.testing.assert_allclose(action, [asked[0], *np.degrees(asked[1:])], rtol=1e-6)
+    ours = json.loads((tmp_path / "out" / "meta" / "vla_zenoh.json").read_text())
+    scale = [float(number) for number in ours["options"]["joint_scale_rad"].split(",")]
+    np.testing.assert_allclose(action * scale, asked, rtol=1e-6)
+    with pytest.raises(SpecError, match="joint_deg, and joint1 slides: name joint"):
+        export(tmp_path / "deg", episodes, [], read_parts("joint_deg"))
+
+
 def test_joint_deltas_on_the_start_of_their_chunk_become_deltas_on_the_step_before(
     tmp_path: Path,
 ) -> None:
@@ -504,7 +527,7 @@ def test_wrench_and_effort_are_parts_of_a_state_where_the_robot_measured_them(
 )
 def test_the_options_of_a_dataset_mean_what_its_spec_does(action: dict[str, Any]) -> None:
     wanted = ActionSpec.model_validate({"horizon": HORIZON, "dt_s": 0.1, **action})
-    found = semantics_of(wanted)
+    found = semantics_of(wanted, load_profile("panda_sim"))
     # Where an option says nothing the spec has its default.
     unused = {"rotation": wanted.rotation, "frame": wanted.frame, "anchor": wanted.anchor}
     assert found.spec.model_copy(update=unused) == wanted

@@ -1,8 +1,8 @@
 """Columns of a dataset, and the state of the robot as one of them.
 
 Actions that are positions of joints, and the state that goes with them, are in the numbers of
-LeRobot's own robots, whose names they have: ``JOINT.pos`` in degrees, ``gripper.pos`` from 0 shut
-to 100 open. All others are in ours.
+LeRobot's own robots, whose names they have: ``JOINT.pos`` in degrees, of a joint that slides in m,
+``gripper.pos`` from 0 shut to 100 open. All others are in ours.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from vla_zenoh_policy_servers.state_vector import (
     PARTS,
     StateNumbers,
     parts_of,
+    sliding_joints,
     state_numbers,
 )
 
@@ -32,6 +33,7 @@ from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation, StatePart
 from vla_zenoh.policy.meaning import ROTATION_FORMS, unturned
 from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
+from vla_zenoh.profile import Profile
 from vla_zenoh.types import Task
 from vla_zenoh_dataset.episodes import RecordedEpisode
 
@@ -135,12 +137,17 @@ def in_lerobots_numbers(spec: ActionSpec) -> bool:
     return spec.space == "joint" and spec.kind == "absolute" and spec.gripper != "delta_m"
 
 
-def worker_options(spec: ActionSpec) -> dict[str, str]:
+def worker_options(spec: ActionSpec, profile: Profile) -> dict[str, str]:
     """What the actions of one arm mean in a dataset, as options of the worker ``lerobot``."""
     options = {"dt_s": repr(spec.dt_s), "gripper": spec.gripper}
     if in_lerobots_numbers(spec):
         grips = spec.gripper != "none"
-        return options | {each: LEROBOT[each] for each in LEROBOT if grips or "grip" not in each}
+        options |= {each: LEROBOT[each] for each in LEROBOT if grips or "grip" not in each}
+        if sliding := sliding_joints(profile):
+            degree = options["joint_scale_rad"]
+            units = ("1" if name in sliding else degree for name in spec.joints)
+            options["joint_scale_rad"] = ",".join(units)
+        return options
     if spec.gripper in ("open_fraction", "binary"):
         options["gripper_open"] = "high" if spec.gripper_open_is_high else "low"
         options["gripper_threshold"] = repr(spec.gripper_threshold)
@@ -159,10 +166,10 @@ def worker_options(spec: ActionSpec) -> dict[str, str]:
     return options | arm | {"position_scale_m": scale}
 
 
-def semantics_of(spec: ActionSpec) -> ActionSemantics:
+def semantics_of(spec: ActionSpec, profile: Profile) -> ActionSemantics:
     """The numbers of a dataset with actions of one arm."""
     return read_action_semantics(
-        {**worker_options(spec), "horizon": str(spec.horizon)}, joints=spec.joints
+        {**worker_options(spec, profile), "horizon": str(spec.horizon)}, joints=spec.joints
     )
 
 
@@ -286,7 +293,7 @@ def _actions(spec: ActionSpec, steps: NDArray[np.float32], run: Run, part: str) 
         max_width_m = robot.require_gripper(f"{run.path}: gripper={spec.gripper}").max_width_m
         shares = [spec.gripper_scale(max_width_m).decode(number) for number in rows[:, -1]]
         rows[:, -1] = np.greater(shares, 0.5) if spec.gripper == "binary" else shares
-    return semantics_of(spec).rows(rows)
+    return semantics_of(spec, run.of_part(part).profile).rows(rows)
 
 
 def states_of(episode: RecordedEpisode, numbers: Mapping[str, StateNumbers]) -> NDArray[np.float32]:
@@ -314,7 +321,7 @@ def numbers_of(episode: RecordedEpisode, parts: Sequence[str]) -> dict[str, Stat
     out: dict[str, StateNumbers] = {}
     for part in episode.spec.parts:
         run, spec = episode.run.of_part(part), episode.spec.action.of(part)
-        own = state_numbers(parts, run.profile, semantics_of(spec).state_units)
+        own = state_numbers(parts, run.profile, semantics_of(spec, run.profile).state_units)
         recorded = run.joints[0].record.names if run.joints else own.joints
         known = set(own.joints) <= set(recorded)
         out[part] = own if known else replace(own, joints=recorded)

@@ -363,8 +363,10 @@ class _Dataset:
     def _options(self) -> dict[str, str] | None:
         """Of the worker ``lerobot`` for a policy of this dataset; None: its arms have others."""
         action, parts = self._spec.action, self._spec.parts
-        options = worker_options(action.of(parts[0]))
-        if any(worker_options(action.of(part)) != options for part in parts):
+        run = self._episodes[0].run
+        each = [worker_options(action.of(part), run.of_part(part).profile) for part in parts]
+        options = each[0]
+        if any(other != options for other in each):
             return None
         if not self._rotation and action.of(parts[0]).space == "tcp":
             options["rotation"] = "none"
