@@ -270,7 +270,9 @@ def test_a_router_that_runs_already_is_used_and_left_running(tmp_path: Path) -> 
     ):
         until("a sim", lambda: "sim" in client.alive, READY_PATIENCE_S)
         until("the others", lambda: len(running.children()) == len(NODES) - 1)
-        assert "one answers already; using it" in running.text
+        (where,) = profile.session.connect
+        assert f"one answers already at {where}; using it, until its program ends" in running.text
+        assert "--connect and --listen, another port" in running.text
         took_s = running.end(signal.SIGTERM)
         assert took_s < END_S + BUSY_S
         assert running.children() == {}

@@ -60,6 +60,11 @@ def test_a_session_from_prompt_to_reset(chain: Chain, person: Person) -> None:
     chain.activate_when_ready()  # once, so that nothing is missing any more
     chain.settle()
     assert "prompt: 'HARD: go up' (worker scripted, 10 Hz)" in person.ok("prompt", "HARD: go up")
+    refused = person.run("prompt", "dance")
+    assert refused.code == REFUSED
+    assert "prompt: 'dance' (worker scripted, 10 Hz), and the worker cannot" in refused.stderr
+    assert "the scripted model does not know the prompt 'dance'" in refused.stderr
+    person.ok("prompt", "HARD: go up")  # what was said of the prompt before is forgotten
     assert "rate: 5 Hz" in person.ok("rate", "5")
     assert "speed: 100 % of the planned speed" in person.ok("speed")
     assert "speed: 30 % of the planned speed" in person.ok("speed", "30 %")

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 PATIENCE_S = 3.0
 POLL_S = 0.05
 MODE_PATIENCE_S = 1.0
+ANSWER_S = 1.0
+FAILED = ("contract: ", "inference_failed: ")
+"""A complaint of a worker begins with it where its model did not answer."""
 
 
 def _answered(command: Callable[..., None]) -> Callable[..., None]:
@@ -46,6 +49,9 @@ def prompt(
 ) -> None:
     """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt.
 
+    Exit status 1 where the worker says within 1 s that its model cannot answer it; it is set all
+    the same.
+
     A moving arm carries on with its plan until the worker has answered the new prompt; without an
     answer it stands timing.max_open_loop_s and watchdog_s after the last chunk, 2.8 s by default.
     `vla-zenoh speed 0` or `deactivate` stop it before that.
@@ -62,7 +68,21 @@ def prompt(
     with target.operator("prompt", text) as client:
         task = client.set_prompt(text)
         said = f"prompt: {task.prompt!r} (worker {task.worker}, {task.rate_hz:g} Hz)"
+        if why := _unanswered(client, task):
+            fail(f"{said}, and the worker cannot answer it: {why}")
         _show(target, client, said)
+
+
+def _unanswered(client: Client, task: Task) -> str:
+    """What the worker says against its prompt within `ANSWER_S`; empty: nothing."""
+
+    def complaint() -> str:
+        status = client.status(worker_node(task.worker))
+        detail = {} if status is None else status.detail
+        why = str(detail.get("complaint", ""))
+        return why if detail.get("prompt") == task.prompt and why.startswith(FAILED) else ""
+
+    return client.wait_for(complaint, ANSWER_S) or ""
 
 
 @options

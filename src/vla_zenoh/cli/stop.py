@@ -49,7 +49,7 @@ class StopAttempt:
     def __init__(self, target: RobotTarget, profile: Profile | StopProfile, *, every: bool) -> None:
         self.target, self.profile, self._every = target, profile, every
         self.clients: list[StopClient] = []
-        self.why = "the router does not answer"
+        self.why = f"the router at {', '.join(profile.session.connect)} does not answer"
         self.over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="stop", daemon=True)
         self._thread.start()

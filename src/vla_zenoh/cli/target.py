@@ -143,6 +143,9 @@ class RobotTarget:
         """Message that this robot has no such node, with `command` for the other robots."""
         if client.other_version:
             return f"no {kind} of {self.named(client)} can be read: {client.other_version}"
+        if not client.session.info.routers_zid():
+            where = ", ".join(client.profile.session.connect)
+            return f"no Zenoh router answers at {where} any more; `vla-zenoh up` starts one"
         none = "No other robot is visible on this router; `vla-zenoh up` starts one"
         there = self.alive(client, *command) or none
         return f"no {kind} of {self.named(client)} is alive. {there}"

@@ -253,7 +253,11 @@ class Host:
             )
         if "router" in self._part.nodes:
             if answers:
-                self._tell("router", "one answers already; using it")
+                self._tell(
+                    "router",
+                    f"one answers already at {self.profile.session.connect[0]}; using it, until "
+                    "its program ends. For one of its own: --connect and --listen, another port",
+                )
                 self.supervisor.children = [
                     child for child in self.supervisor.children if child.command.kind != "router"
                 ]

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import shlex
+import socket
 from pathlib import Path
 
 import pytest
+from camera_rig import free_endpoint, until
 
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.cli.stop import StopAttempt
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.cli.up import target_of
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.resources import names
@@ -130,3 +135,20 @@ def test_up_tells_of_a_router_that_its_host_alone_goes_to() -> None:
     finally:
         host.stop()
     assert typed == ("vla-zenoh status --profile panda_sim_two_sites --connect tcp/127.0.0.1:7467")
+
+
+def test_a_router_that_is_gone_or_hangs_is_named_by_its_endpoint() -> None:
+    where = free_endpoint()
+    aim = RobotTarget("panda_sim", [where])
+    profile = override(aim.load(), {"session": {"listen": [where]}})
+    router = open_session(profile.session, mode="router")
+    with open_session(profile.session) as session:
+        client = Client(profile, session)
+        assert "no command node of robot panda" in aim.no_node(client, kind="command node")
+        router.close()
+        until("the link is lost", lambda: not session.info.routers_zid())
+        assert f"no Zenoh router answers at {where} any more" in aim.no_node(client)
+    with socket.create_server(("127.0.0.1", int(where.rpartition(":")[2]))):  # no Zenoh there
+        attempt = StopAttempt(aim, aim.load_for_stop(), every=False)
+        assert attempt.why == f"the router at {where} does not answer"
+        attempt.over.set()

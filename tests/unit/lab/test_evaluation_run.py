@@ -425,6 +425,15 @@ def test_a_page_of_one_run_shows_provenance_verdict_curves_and_video(judged: Pat
         assert f'draw("{part}", {{"data"' in body
 
 
+def test_a_run_is_named_after_its_folder_from_within_it_too(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(recording.parent)
+    run = evaluate_loaded(load_run(Path("run.mcap")))
+    assert run.name == recording.parent.name
+    assert "<h1>Evaluation of lab</h1>" in page([run], {})
+
+
 def test_a_page_counts_only_runs(judged: Path, recording: Path) -> None:
     runs = [evaluate_loaded(load_run(judged)), evaluate_loaded(load_run(recording))]
     text = page(runs, {})

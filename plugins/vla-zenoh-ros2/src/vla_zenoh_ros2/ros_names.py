@@ -46,7 +46,7 @@ class RosDomain:
         return f"{through}, domain {self.number}"
 
     @property
-    def distribution(self) -> str:
+    def distribution(self) -> Literal["humble", "jazzy"]:
         """One whose types have these hashes: they are the same from Iron to Lyrical."""
         return "jazzy" if self.hashed else "humble"
 

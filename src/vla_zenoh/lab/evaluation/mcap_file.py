@@ -129,7 +129,8 @@ def evaluate_parts(run: Run, *, pictures: int = 0) -> list[Evaluation]:
 def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
     """Evaluate a run of one arm or part; `Evaluation.problems` lists what cannot be read."""
     zero_ns = run.began_ns
-    name = run.path.parent.name if run.path.stem == "run" else run.path.stem
+    own = run.path.stem
+    name = (run.path.resolve().parent.name if own == "run" else "") or own
     name += f"/{run.part}" if run.part else ""
     out = Evaluation(name, run.path, problems=list(run.problems))
     if run.file.ended is None and not run.file.damage:

@@ -158,6 +158,10 @@ class RobotSession:
         before, self.task, self._task_received_s = self.task, task.record, time.monotonic()
         if before is not None and before.requested_hz != self.task.requested_hz:
             self.due_s = min(self.due_s, self._task_received_s)
+        if self._failure and before is not None and before.prompt != self.task.prompt:
+            # That was of the prompt before; this one is tried at once.
+            self.complaint = self._failure = ""
+            self.due_s = self._task_received_s
         if task.record.episode == self._episode:
             return
         self._episode = task.record.episode
