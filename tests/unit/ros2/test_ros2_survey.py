@@ -54,7 +54,9 @@ class Peer:
             self._session,
             key,
             cache=zenoh.ext.CacheConfig(max_samples=1),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(
+                heartbeat=None, sporadic_heartbeat=None
+            ),
             publisher_detection=True,
         )
         publisher.put(self.messages.encode(self.messages.new(TEXT, data=text)))
