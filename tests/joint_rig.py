@@ -12,6 +12,7 @@ from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.kinematics.kinematics import pose_error
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
+from vla_zenoh.policy.meaning import wrapped
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.types import FloatArray, JointCommand
 
@@ -82,7 +83,9 @@ class Joints:
 
     def columns(self, joints_rad: FloatArray) -> list[float]:
         """Joints in chain order as the worker's columns."""
-        order = self.kinematics.arm_joints
+        order, endless = self.kinematics.arm_joints, self.kinematics.endless
+        if self.rig.spec.action.turns == "wrapped":
+            joints_rad = np.where(endless, wrapped(joints_rad), joints_rad)
         return [float(joints_rad[order.index(name)]) for name in self.names]
 
     def send(self, *rows: Any, **how: Any) -> None:

@@ -14,16 +14,22 @@ LINK = """<link name="link{n}"><collision><geometry><sphere radius="0.01"/></geo
 JOINT = """
 <joint name="joint{n}" type="{kind}"><parent link="link{before}"/><child link="link{n}"/>
 <origin xyz="{length} 0 0"/><axis xyz="{axis}"/>
-<limit lower="{low}" upper="{high}" velocity="{fast}" effort="10"/></joint>"""
+<limit {ends} velocity="{fast}" effort="{effort}"/></joint>"""
+KINDS = {"s": "prismatic", "t": "revolute", "e": "continuous"}
+SLIDES = f'lower="0" upper="{SLIDE_M}"'
+TURNS = f'lower="{-TURN_RAD}" upper="{TURN_RAD}"'
+EFFORT = 10.0
 
 
-def made_arm(folder: Path, chain: str, length_m: float = 0.15) -> Profile:
+def made_arm(folder: Path, chain: str, length_m: float = 0.15, effort: float = EFFORT) -> Profile:
     """An arm at rest in the middle of its ranges.
 
     Args:
         folder: for its description.
-        chain: letters of its joints: t turns, s slides, each followed by its axis: ``szty``.
+        chain: letters of its joints: t turns, e turns without an end, s slides, each followed by
+            its axis: ``szty``.
         length_m: of a link.
+        effort: of a joint, Nm or N.
     """
     kinds = [chain[at : at + 2] for at in range(0, len(chain), 2)]
     parts = [LINK.format(n=0)]
@@ -34,11 +40,11 @@ def made_arm(folder: Path, chain: str, length_m: float = 0.15) -> Profile:
             JOINT.format(
                 n=n,
                 before=n - 1,
-                kind="prismatic" if slides else "revolute",
+                kind=KINDS[kind],
                 length=0.0 if n == 1 else length_m,
                 axis=AXES[axis],
-                low=0.0 if slides else -TURN_RAD,
-                high=SLIDE_M if slides else TURN_RAD,
+                ends={"s": SLIDES, "t": TURNS, "e": ""}[kind],
+                effort=effort,
                 fast=SLIDE_M_S if slides else TURN_RAD_S,
             )
         )

@@ -41,7 +41,7 @@ from vla_zenoh.kinematics.so3 import (
     rotation_from_rpy,
 )
 from vla_zenoh.policy import ActionSpec, ControllerSpec
-from vla_zenoh.policy.meaning import unturned
+from vla_zenoh.policy.meaning import nearest_turn, unturned
 from vla_zenoh.types import FloatArray, unit_quaternion
 
 Steps = NDArray[np.float32] | NDArray[np.float64]
@@ -106,15 +106,23 @@ def step_pose(spec: ActionSpec, step: FloatArray, before: Pose, start: Pose | No
 
 
 def step_joints(
-    spec: ActionSpec, step: FloatArray, before_rad: FloatArray, start_rad: FloatArray
+    spec: ActionSpec,
+    step: FloatArray,
+    before_rad: FloatArray,
+    start_rad: FloatArray,
+    endless: NDArray[np.bool_],
 ) -> FloatArray:
-    """The joints (n,) that a step (D,) asks for, after `before_rad` in a chunk from `start_rad`."""
+    """The joints (n,) that a step (D,) asks for, after `before_rad` in a chunk from `start_rad`.
+
+    A target goes the shortest way from the step before with the joints (n,) that are `endless`.
+    """
     numbers = np.asarray(step[: spec.arm_size], np.float64)
-    if spec.kind == "absolute":
-        return numbers
     if spec.kind == "velocity":
         return before_rad + numbers * spec.dt_s
-    return (start_rad if spec.relative_to == "start" else before_rad) + numbers
+    if not spec.targets:
+        return before_rad + numbers
+    target_rad = numbers if spec.kind == "absolute" else start_rad + numbers
+    return np.where(endless, nearest_turn(target_rad, before_rad), target_rad)
 
 
 def covered_step(

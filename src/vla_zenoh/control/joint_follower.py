@@ -324,7 +324,7 @@ class JointFollower:
         onto: FloatArray,
         dt_s: float,
     ) -> FloatArray:
-        posture = POSTURE_1_S * (self.posture_rad - joints)
+        posture = POSTURE_1_S * (self.kinematics.nearest(self.posture_rad, joints) - joints)
         fastest = float(np.abs(posture).max())
         if fastest > POSTURE_RAD_S:
             posture *= POSTURE_RAD_S / fastest

@@ -126,7 +126,10 @@ class JointBounds:
         self, action: ActionSpec, steps: FloatArray, base_rad: FloatArray
     ) -> Rejection | None:
         """Why targets (n, D) in chain order are too far outside their ranges to be intended."""
-        asked_rad = np.array([step_joints(action, step, base_rad, base_rad) for step in steps])
+        endless = self.kinematics.endless
+        asked_rad = np.array(
+            [step_joints(action, step, base_rad, base_rad, endless) for step in steps]
+        )
         away_rad = np.maximum(self.lower_rad - asked_rad, asked_rad - self.upper_rad)
         slides = self.kinematics.slides
         mosts = REJECT_FACTOR * np.where(slides, self.limits.step_m, self.limits.step_rad)

@@ -260,6 +260,8 @@ def beyond_radians(
     """Why joints (H, D) are too far for radians, with the largest number and the most allowed."""
     scale = spec.dt_s if spec.kind == "velocity" else 1.0
     most_rad = FURTHEST_RAD if spec.targets else REJECT_FACTOR * limits.step_rad
+    if spec.kind == "absolute" and spec.turns == "counted":
+        return None
     largest = scale * float(np.abs(steps[:, : spec.arm_size]).max())
     if largest <= most_rad:
         return None

@@ -250,9 +250,10 @@ class PoseToJoint:
         w, dt_s = self._pull_1_s, self._dt_s
         self._pull_rate_1_s += (w * w * (share - self._pull) - 2 * w * self._pull_rate_1_s) * dt_s
         self._pull += self._pull_rate_1_s * dt_s
-        way_rad = self._posture_rad - self._now.position_rad
+        here_rad = self._now.position_rad
+        way_rad = self._kinematics.nearest(self._posture_rad, here_rad) - here_rad
         shortened = min(1.0, LONGEST_RAD / max(float(np.abs(way_rad).max()), 1e-9))
-        return self._now.position_rad + self._pull * shortened * way_rad
+        return here_rad + self._pull * shortened * way_rad
 
     @property
     def position_rad(self) -> FloatArray:

@@ -88,7 +88,7 @@ class Margins(NamedTuple):
     """Distances of an arm to its bounds.
 
     Args:
-        joint_rad: smallest distance of a joint to the end of its range.
+        joint_rad: smallest distance of a joint to the end of its range, inf where none has one.
         joint: its name.
         singular_value: smallest of the Jacobian.
         self_m: smallest distance of the arm to itself, inf where nothing can touch.

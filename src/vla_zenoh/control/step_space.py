@@ -152,8 +152,9 @@ class JointSteps:
         self, action: ActionSpec, numbers: FloatArray, start: Goal, base: Goal, width_m: float
     ) -> Goal:
         start_rad, base_rad = self.origin(start).joints_rad, self.origin(base).joints_rad
-        asked_rad = step_joints(action, numbers, start_rad, base_rad)
-        return joint_goal(self._bounds.kinematics, asked_rad, width_m)
+        arm = self._bounds.kinematics
+        asked_rad = step_joints(action, numbers, start_rad, base_rad, arm.endless)
+        return joint_goal(arm, asked_rad, width_m)
 
     def way(self, start: Goal, end: Goal) -> tuple[float, float, float]:
         start_rad = self.origin(start).joints_rad

@@ -117,8 +117,7 @@ class CollisionModel:
             if shapes[first].parentJoint != shapes[second].parentJoint
         ]
         random = np.random.default_rng(0)  # the same pairs at every start
-        lower, span = kinematics.lower_rad, kinematics.upper_rad - kinematics.lower_rad
-        samples_rad = lower + span * random.random((SAMPLES, kinematics.size))
+        samples_rad = random.uniform(*kinematics.sampled_rad, (SAMPLES, kinematics.size))
         if home_rad is not None:
             samples_rad = np.vstack([samples_rad, home_rad])
         distances = self._at(samples_rad, pairs)

@@ -171,11 +171,19 @@ class Description:
         return name
 
     def text(self, followers: Mapping[str, Mimic]) -> str:
-        """The URDF with joints named by `model_name`, of which only `followers` mimic another."""
+        """The URDF with joints named by `model_name`, of which only `followers` mimic another.
+
+        Those that turn without an end are angles there, too, not points of a circle.
+        """
         root = self._root()
         for element in root.findall("joint"):
             name = element.attrib["name"]
             element.set("name", self.model_name(name))
+            if element.get("type") == "continuous":
+                element.set("type", "revolute")
+                for limit in element.findall("limit"):
+                    element.remove(limit)
+                ElementTree.SubElement(element, "limit", effort="0", velocity="0")
             for mimic in element.findall("mimic"):
                 element.remove(mimic)
             if (follows := followers.get(name)) is not None:

@@ -21,7 +21,7 @@ from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError, RecordError, nearest
 from vla_zenoh.kinematics.description import MOVING, DescribedJoint, Description, Mimic
 from vla_zenoh.kinematics.so3 import Pose, log3, quat_from_rotation
-from vla_zenoh.policy.meaning import reference
+from vla_zenoh.policy.meaning import nearest_turn, reference
 from vla_zenoh.profile import JointEnds, Profile, RobotProfile
 from vla_zenoh.types import FloatArray, JointState
 
@@ -55,7 +55,8 @@ class Kinematics:
         arm_joints: in any order.
         finger_joints: locked where the hand is widest.
         base_frame: poses are given in this link, which must not move; None: the URDF's root.
-        joint_range_rad: narrows the range of each of `arm_joints`; empty: as the URDF has it.
+        joint_range_rad: narrows the range of each of `arm_joints`, None does not; empty: all are as
+            the URDF has them.
         locked_rad: where joints between base and TCP stand that are not commanded.
         finger_ends: positions of the open and shut hand; None: open at their upper limit, which
             needs joints that slide.
@@ -74,7 +75,7 @@ class Kinematics:
         *,
         base_frame: str | None = None,
         finger_ends: JointEnds | None = None,
-        joint_range_rad: Sequence[tuple[float, float]] = (),
+        joint_range_rad: Sequence[tuple[float, float] | None] = (),
         locked_rad: Mapping[str, float] | None = None,
     ) -> None:
         self.urdf = urdf
@@ -118,9 +119,13 @@ class Kinematics:
         limits = [_limits(described, joint, followers) for joint in joints]
         self.lower_rad, self.upper_rad, self.velocity_rad_s = np.array(limits).T
         if joint_range_rad:
-            lower, upper = zip(*joint_range_rad, strict=True)
+            ranges = [each or (-math.inf, math.inf) for each in joint_range_rad]
+            lower, upper = zip(*ranges, strict=True)
             self.lower_rad = np.maximum(self.lower_rad, self.ordered(arm_joints, lower))
             self.upper_rad = np.minimum(self.upper_rad, self.ordered(arm_joints, upper))
+        self.endless = np.isinf(self.upper_rad)
+        """(n,) joints that turn without an end, from -inf to inf; their positions are counted over
+        turns."""
         moves = (self.lower_rad < self.upper_rad) & (self.velocity_rad_s > 0)
         moves &= np.isfinite(self.velocity_rad_s)
         for index, name in enumerate(self.arm_joints):
@@ -128,7 +133,7 @@ class Kinematics:
                 unit = self.unit(index)
                 raise ProfileError(
                     f"joint {name!r} of {urdf.name} has no room to move: its <limit> needs "
-                    f"lower < upper ({unit}) and velocity > 0 ({unit}/s)"
+                    f"lower < upper ({unit}; not if it is continuous) and velocity > 0 ({unit}/s)"
                 )
 
     @property
@@ -155,6 +160,19 @@ class Kinematics:
         return placement.rotation.T @ placement.translation
 
     # -- joints -------------------------------------------------------------------------------
+    @property
+    def sampled_rad(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper ends (n,) between which the arm is in every place: of endless joints
+        within one turn."""
+        lower_rad = np.where(self.endless, -math.pi, self.lower_rad)
+        return lower_rad, np.where(self.endless, math.pi, self.upper_rad)
+
+    def nearest(self, joints_rad: FloatArray, near_rad: FloatArray) -> FloatArray:
+        """The same place of the arm, with endless joints on the shortest way from `near_rad`."""
+        if not self.endless.any():
+            return joints_rad
+        return np.where(self.endless, nearest_turn(joints_rad, near_rad), joints_rad)
+
     def ordered(self, names: Sequence[str], values: ArrayLike) -> FloatArray:
         """`values` (n,) given for `names` in any order, in the order of `arm_joints`.
 
@@ -344,7 +362,8 @@ class InverseKinematics:
                 return Approach(joints, error_m, error_rad, solved, wanted, jacobian, effort)
             last, damping, drift = squared, 0.5 * squared + DAMPING_BIAS, None
             if iteration == 0:  # afterwards the pose alone decides
-                drift = _shortened(POSTURE_GAIN * (self.posture_rad - joints), MAX_POSTURE_STEP_RAD)
+                posture_rad = self._kinematics.nearest(self.posture_rad, joints)
+                drift = _shortened(POSTURE_GAIN * (posture_rad - joints), MAX_POSTURE_STEP_RAD)
             step = _damped_step(error, jacobian, drift, damping)
             wanted = joints + _shortened(step, MAX_JOINT_STEP_RAD)
             if bounded:
@@ -432,10 +451,10 @@ def _followers(described: Description, arm_joints: Sequence[str]) -> dict[str, M
                 f"joint {name!r} of {described.name} follows joint {joint.mimic.joint!r} (mimic) "
                 "and is not commanded: leave it out of arm_joints"
             )
-        if joint.kind not in ("revolute", "prismatic"):
+        if joint.kind not in MOVING:
             raise ProfileError(
-                f"joint {name!r} of {described.name} is {joint.kind}; only joints with limits are "
-                "supported: make it revolute and give it limits"
+                f"joint {name!r} of {described.name} is {joint.kind}: an arm's joint turns about "
+                f"one axis or slides along one ({', '.join(MOVING)})"
             )
     followers: dict[str, Mimic] = {}
     for name, joint in described.joints.items():
@@ -513,12 +532,8 @@ def _locked(model: Any, described: Description, known: Mapping[str, float]) -> F
     position = pin.neutral(model)
     for name in (each.name for each in described.joints.values() if each.moves):
         joint = model.joints[model.getJointId(described.model_name(name))]
-        index = joint.idx_q
-        value = _position(described, name, known)
         if joint.nq == 1:
-            position[index] = value
-        elif joint.nq == 2:  # continuous
-            position[index : index + 2] = math.cos(value), math.sin(value)
+            position[joint.idx_q] = _position(described, name, known)
     return position
 
 

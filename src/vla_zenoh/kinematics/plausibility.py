@@ -38,7 +38,7 @@ def implausible(
         fastest = MAX_LENGTH_M if slides else MAX_SPEED_RAD_S
         slowest = MIN_SPEED_M_S if slides else MIN_SPEED_RAD_S
         unit, wrong = ("m", "millimetres") if slides else ("rad", "degrees")
-        if max(abs(low), abs(high)) > furthest:
+        if not kinematics.endless[index] and max(abs(low), abs(high)) > furthest:
             yield (
                 f"joint {joint!r} of {name} goes from {low:g} to {high:g} {unit}: are these "
                 f"{wrong}? Correct the description, or give robot.joint_range_rad"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.policy.inference import Observation
+from vla_zenoh.policy.meaning import wrapped
 from vla_zenoh.types import FloatArray
 
 MOVED_M, MOVED_RAD = 0.02, 0.1
@@ -85,6 +86,8 @@ def _moved(then: Observation, now: Observation) -> bool | None:
         way_m = float(np.linalg.norm(now.pose.position_m - then.pose.position_m))
         return way_m > MOVED_M or angle_rad > MOVED_RAD
     if then.joint is not None and now.joint is not None:
-        turns: FloatArray = np.abs(now.joint.position_rad - then.joint.position_rad)
-        return bool(np.max(turns, initial=0.0) > MOVED_RAD)
+        ways_rad: FloatArray = now.joint.position_rad - then.joint.position_rad
+        if now.joint.endless:
+            ways_rad = wrapped(ways_rad)
+        return bool(np.max(np.abs(ways_rad), initial=0.0) > MOVED_RAD)
     return None

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.policy.meaning import RotationForm, toward, unturned
+from vla_zenoh.policy.meaning import RotationForm, nearest_turn, toward, unturned, wrapped
 from vla_zenoh.policy.plan_clock import PlanClock, idle_time
 from vla_zenoh.policy.spec import ActionSpec, ModelSpec
 from vla_zenoh.types import (
@@ -366,7 +366,7 @@ class ChunkPrefix:
         if (self._resumed_ns - last.observed_ns) / 1e9 > self._max_age_s:
             return None
         try:
-            left = rest_of(self._action, last.steps, had)
+            left = rest_of(self._action, last.steps, had, _wrapping(self._action, observation))
         except SpecError:  # numbers that are no rotation, which no arm follows
             return None
         if not len(left):
@@ -375,19 +375,38 @@ class ChunkPrefix:
         return Committed(left, min(math.ceil(late - ALIGNED), len(left)))
 
 
-def rest_of(spec: ActionSpec, steps: NDArray[np.float32], had: float) -> NDArray[np.float32]:
+def _wrapping(spec: ActionSpec, observation: Observation) -> NDArray[np.bool_]:
+    """The columns (D,) of a step that are positions of joints within one turn, without an end."""
+    found = np.zeros(spec.dimension, bool)
+    for part, seen in (observation.parts or {"": observation}).items():
+        own, columns = spec.of(part), spec.columns(part)
+        if own.kind == "absolute" and own.turns == "wrapped" and seen.joint is not None:
+            found[columns][: len(own.joints)] = np.isin(own.joints, seen.joint.endless)
+    return found
+
+
+def rest_of(
+    spec: ActionSpec,
+    steps: NDArray[np.float32],
+    had: float,
+    wrapping: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float32]:
     """The steps of a chunk that remain after `had` of them, which may be fractional.
 
     They follow the same path, resampled from the observation on: deltas are weighted sums of two
-    neighbours, absolute poses interpolate between two, on the shortest turn. Absolute gripper
-    numbers keep their current value.
+    neighbours, absolute poses and the columns that are `wrapping` (D,) interpolate between two, on
+    the shortest turn. Absolute gripper numbers keep their current value.
     """
     whole = math.floor(had + ALIGNED)
     share = max(had - whole, 0.0)
     if share < ALIGNED:
         return steps[whole:].copy()
     first, second = steps[whole:-1].astype(np.float64), steps[whole + 1 :].astype(np.float64)
+    if wrapping is not None:
+        second[:, wrapping] = nearest_turn(second[:, wrapping], first[:, wrapping])
     mixed = (1.0 - share) * first + share * second
+    if wrapping is not None:
+        mixed[:, wrapping] = wrapped(mixed[:, wrapping])
     if spec.space == "tcp" and (spec.kind == "absolute" or spec.rotation_form.size > 3):
         turns = spec.rotation_columns
         each = zip(first[:, turns], second[:, turns], strict=True)

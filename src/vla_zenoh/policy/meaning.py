@@ -14,14 +14,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import SpecError
+from vla_zenoh.types import JointState
 
 Numbers = Sequence[float] | NDArray[np.float64]
+TURN_RAD = 2 * math.pi
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 """The rotation that does not turn, as x, y, z, w."""
 CLEAR = 0.01
@@ -120,7 +123,7 @@ def _principal_rpy(
 
 
 def _nearest_angle(angle_rad: float, near_rad: float) -> float:
-    return angle_rad + 2 * math.pi * round((near_rad - angle_rad) / (2 * math.pi))
+    return angle_rad + TURN_RAD * round((near_rad - angle_rad) / TURN_RAD)
 
 
 def _columns(quaternion: Numbers, near: Numbers) -> list[float]:
@@ -233,6 +236,29 @@ two rows, as PyTorch3D, UMI and Diffusion Policy have it."""
 def unturned(rotation: str) -> list[float]:
     """The numbers of a rotation that does not turn."""
     return ROTATION_FORMS[rotation].encode(IDENTITY, IDENTITY)
+
+
+# -- joints that turn without an end --------------------------------------------------------------
+def nearest_turn(angles_rad: NDArray[Any], near_rad: NDArray[Any]) -> NDArray[np.float64]:
+    """Angles (n,) or (k, n), each by whole turns as near as it gets to that of `near_rad`."""
+    return angles_rad + TURN_RAD * np.round((near_rad - angles_rad) / TURN_RAD)
+
+
+def wrapped(angles_rad: NDArray[Any]) -> NDArray[np.float64]:
+    """The same angles within (-pi, pi]."""
+    return angles_rad - TURN_RAD * np.ceil((angles_rad - math.pi) / TURN_RAD)
+
+
+def joints_as(state: JointState, turns: str) -> JointState:
+    """A state with its endless joints as `ActionSpec.turns` says: ``wrapped`` or ``counted``."""
+    if turns == "counted" or not state.endless:
+        return state
+    endless = np.isin(state.names, state.endless)
+    both = (state.position_rad, state.reference_rad)
+    position_rad, reference_rad = (
+        None if each is None else np.where(endless, wrapped(each), each) for each in both
+    )
+    return replace(state, position_rad=position_rad, reference_rad=reference_rad)
 
 
 # -- openings of a gripper ------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     StatePart,
 )
+from vla_zenoh.policy.meaning import joints_as
 from vla_zenoh.policy.resize import scaled
 from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 from vla_zenoh.types import (
@@ -252,17 +253,18 @@ def assemble(
         name, skew_s, others = apart
         return NotReady(f"{name} is {skew_s:.3f} s apart from the {others}")
     seq = oldest.header.seq if oldest else 0
-    now = _observation(wanted, moment, (stamp_ns, seq, task), robot)
+    now = _observation(spec, moment, (stamp_ns, seq, task), robot)
     if wanted.history == 1 or isinstance(now, NotReady):
         return now
-    before = _history(now, wanted, streams, episode_ns)
+    before = _history(now, spec, streams, episode_ns)
     return before if isinstance(before, NotReady) else replace(now, history=before)
 
 
 def _observation(
-    wanted: ObservationSpec, moment: Moment, first: tuple[int, int, Task], robot: str
+    spec: ModelSpec, moment: Moment, first: tuple[int, int, Task], robot: str
 ) -> Observation | NotReady:
     """The observation of a moment; `first`: its stamp, number and task."""
+    wanted = spec.observation
     found: dict[str, dict[str, Any]] = defaultdict(dict)
     for stream, entry in moment.states.items():
         part, _, kind = stream.rpartition("/")
@@ -274,6 +276,8 @@ def _observation(
             if value is None:
                 where = _STATE.format(stream)
                 return NotReady(f"{where} holds no {name}: this robot does not measure it")
+            if what == "joint":
+                value = joints_as(value, spec.action.of(part).turns)
             found[part][name] = value
     images = {c.camera: prepare_image(moment.images[c.camera].record, c) for c in wanted.cameras}
     depth = {c.camera: prepare_depth(moment.depth[c.camera].record, c) for c in wanted.depth}
@@ -284,9 +288,10 @@ def _observation(
 
 
 def _history(
-    now: Observation, wanted: ObservationSpec, streams: Streams, episode_ns: int
+    now: Observation, spec: ModelSpec, streams: Streams, episode_ns: int
 ) -> tuple[Observation, ...] | NotReady:
     """The observations before this one, oldest first, or why there are none."""
+    wanted = spec.observation
     assert wanted.history_spacing_s is not None
     leading = streams.leading()
     first_ns = max(one.first_since(episode_ns) for one in leading)
@@ -309,7 +314,7 @@ def _history(
         pictures = [*moment.images.values(), *moment.depth.values()]
         lead = min(pictures or moment.states.values(), key=_stamp_ns).header
         first = lead.stamp_wall_ns, lead.seq, now.task
-        then = _observation(wanted, moment, first, now.robot)
+        then = _observation(spec, moment, first, now.robot)
         if isinstance(then, NotReady):
             return then
         before.append(then)

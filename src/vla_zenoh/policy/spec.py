@@ -245,6 +245,9 @@ class ActionSpec(_Spec):
             second (m/s and rad/s, for `dt_s`).
         space: ``tcp`` poses of the TCP; ``joint`` positions of the arm's joints.
         joints: names of the joints, in the order of the columns.
+        turns: positions of joints that turn without an end, in the state that the model observes
+            and in its steps: ``wrapped`` within (-pi, pi], or ``counted`` over turns. Either way
+            the arm goes to a target on the shortest way.
         frame: axes of a delta or velocity: the robot's ``base`` or the ``tcp`` at that moment. An
             absolute pose is always in the base frame.
         anchor: pose or joints that a chunk of deltas or velocities begins at: the ``goal`` in force
@@ -269,7 +272,7 @@ class ActionSpec(_Spec):
             `horizon` and `dt_s`, are then unused. See `of_parts`.
     """
 
-    LATER = ("parts",)
+    LATER = ("parts", "turns")
 
     horizon: int = Field(ge=1, le=1000)
     dt_s: float = Field(gt=0, le=60)
@@ -290,6 +293,7 @@ class ActionSpec(_Spec):
     joints: Annotated[tuple[Text, ...], AfterValidator(_differ)] = Field(
         default=(), max_length=MAX_JOINTS, strict=False
     )
+    turns: Literal["wrapped", "counted"] = "wrapped"
     parts: tuple[PartAction, ...] = Field(default=(), max_length=MAX_PARTS, strict=False)
 
     @staticmethod

@@ -112,7 +112,8 @@ class RobotProfile(Section):
         tcp_frame: link whose pose is controlled.
         arm_joints: in the order of every list of joint values in the profile.
         joint_range_rad: lower and upper end for each of arm_joints, within those of the
-            description; empty: those. m for a joint that slides, here and in home_rad.
+            description, null: those; empty: those of all. m for a joint that slides, here and in
+            home_rad.
         locked_rad: where joints stand that lie between base_frame and tcp_frame and are not
             commanded, as a torso: name -> rad, or m where it slides.
         finger_joints: of the gripper; their states give its width. Prismatic ones add up to it; for
@@ -130,7 +131,7 @@ class RobotProfile(Section):
     base_frame: Word
     tcp_frame: Word
     arm_joints: Words = Field(min_length=1)
-    joint_range_rad: Annotated[tuple[Range, ...], Field(strict=False)] = ()
+    joint_range_rad: Annotated[tuple[Range | None, ...], Field(strict=False)] = ()
     locked_rad: dict[Word, float] = Field(default_factory=dict)
     finger_joints: Words = ()
     home_rad: tuple[float, ...] = Field(strict=False)
@@ -173,7 +174,7 @@ class RobotProfile(Section):
             if abs(angle) > 2 * math.pi:
                 yield ("home_rad", str(index)), f"is {angle:g}: more than a turn; give radians"
         for index, ends in enumerate(self.joint_range_rad):
-            if max(map(abs, ends)) > 4 * math.pi:
+            if ends is not None and max(map(abs, ends)) > 4 * math.pi:
                 why = f"is {ends[0]:g} to {ends[1]:g}: more than two turns; give radians"
                 yield ("joint_range_rad", str(index)), why
         for name in sorted(set(self.arm_joints) & self.locked_rad.keys()):

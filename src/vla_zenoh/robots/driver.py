@@ -190,14 +190,24 @@ class RobotDriver(ABC):
 
         return home_orientation(self.profile, self.kinematics)
 
+    @property
+    def turned_rad(self) -> FloatArray | float:
+        """(n,) whole turns by which our count of endless joints is more than the robot's numbers.
+
+        As of its last reading: what the robot is sent is near to what it reports, counted or not.
+        """
+        return 0.0
+
     def command_of(self, reference: PoseReference | JointReference) -> PoseCommand | JointCommand:
-        """A reference as a command record.
+        """A reference as a command record, in the robot's own numbers.
 
         Of the two signs of its quaternion it has that nearer to the home orientation, as measured
         poses have: of a tool that points down w is about zero, and its sign is that of rounding.
         """
         if isinstance(reference, JointReference):
-            return JointCommand(self.profile.robot.arm_joints, *reference, STREAMING)
+            position_rad, *rates = reference
+            position_rad = position_rad - self.turned_rad
+            return JointCommand(self.profile.robot.arm_joints, position_rad, *rates, STREAMING)
         position_m, rotation, twist, acceleration = reference
         quat_xyzw = np.array(toward(quat_from_rotation(rotation), self.home_quat))
         return PoseCommand(

@@ -1,12 +1,14 @@
 """Converts a robot's joint states to our joint, pose and gripper states.
 
 Positions have to be finite, new, and possible for this arm. Missing velocities are differentiated,
-missing efforts are None.
+missing efforts are None. Joints that turn without an end are counted over turns, however the robot
+reports them: each reading is by whole turns as near as it gets to the one before.
 """
 
 from __future__ import annotations
 
 import bisect
+import itertools
 import threading
 from collections import deque
 
@@ -16,7 +18,7 @@ from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import Kinematics, home_orientation
 from vla_zenoh.kinematics.so3 import quat_from_rotation
-from vla_zenoh.policy.meaning import toward
+from vla_zenoh.policy.meaning import nearest_turn, toward, wrapped
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.driver import Measurement
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
@@ -27,6 +29,8 @@ MOVING_M_S = 0.002
 BEYOND = 10.0
 """A joint may report this multiple of the range and speed of its description: zero points are set
 in many ways, garbage is further off."""
+MOST_TURNED_RAD = 1e5
+"""No joint has turned further: some 16 000 turns."""
 FURTHEST = 10.0
 """Larger positions (m or rad) and speeds of finger joints are garbage."""
 RESTARTED_NS = 1_000_000_000
@@ -168,12 +172,16 @@ class JointReading:
         self._kinematics = kinematics
         self._home_quat = home_orientation(profile, kinematics)
         at = [kinematics.arm_joints.index(name) for name in robot.arm_joints]
-        lower_rad, upper_rad = kinematics.lower_rad[at], kinematics.upper_rad[at]
+        lower_rad, upper_rad = (ends_rad[at] for ends_rad in kinematics.sampled_rad)
+        self._endless = kinematics.endless[at]
         self._middle_rad = (lower_rad + upper_rad) / 2
-        self._furthest_rad = BEYOND * (upper_rad - lower_rad) / 2
+        furthest_rad = BEYOND * (upper_rad - lower_rad) / 2
+        self._furthest_rad = np.where(self._endless, MOST_TURNED_RAD, furthest_rad)
         self._fastest_rad_s = BEYOND * kinematics.velocity_rad_s[at]
         self._arm_newness, self._finger_newness = StampFilter(), StampFilter()
         self.joints: JointState | None = None
+        self.turned_rad: FloatArray = np.zeros(len(at))
+        """(n,) whole turns by which our positions are more than the robot's."""
         self.stamp_ns = 0
         self.width_m: float | None = None
         self.width_stamp_ns = 0
@@ -200,20 +208,33 @@ class JointReading:
             raise CodecError("partial", f"joint states of this arm without {', '.join(missing)}")
         self._check_locked(joints, places)
         at = [places[name] for name in self.arm_joints]
-        position = _finite("position", joints.position[at])
-        self._check(position - self._middle_rad, self._furthest_rad, position, "rad")
+        reported_rad = _finite("position", joints.position[at])
+        self._check(reported_rad - self._middle_rad, self._furthest_rad, reported_rad, "rad")
+        position = self._counted(reported_rad)
         if joints.velocity is None:
             velocity = self._velocity(position, stamp_ns)
         else:
             velocity = _finite("velocity", joints.velocity[at])
             self._check(velocity, self._fastest_rad_s, velocity, "rad/s")
         self._arm_newness.check(made_ns)
+        endless = tuple(itertools.compress(self.arm_joints, self._endless))
         try:
-            state = JointState(self.arm_joints, position, velocity, self._effort(joints, at))
+            state = JointState(
+                self.arm_joints, position, velocity, self._effort(joints, at), endless=endless
+            )
         except RecordError as error:
             raise CodecError("invalid", str(error)) from error
         self.joints, self.stamp_ns = state, stamp_ns
+        self.turned_rad = position - reported_rad
         return state
+
+    def _counted(self, reported_rad: FloatArray) -> FloatArray:
+        """The positions (n,) with endless joints counted over turns."""
+        last = self.joints
+        here = (
+            wrapped(reported_rad) if last is None else nearest_turn(reported_rad, last.position_rad)
+        )
+        return np.where(self._endless, here, reported_rad)
 
     def _check_locked(self, joints: Joints, places: dict[str, int]) -> None:
         """Reject states in which a joint that is not commanded is not where poses assume it."""

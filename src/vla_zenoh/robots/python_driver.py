@@ -131,6 +131,10 @@ class PythonDriver(RobotDriver):
             why = "the gripper lost its object and was not opened"
             self.report.emit(Event("warning", "notice", "object_lost", why))
 
+    @property
+    def turned_rad(self) -> FloatArray:
+        return self._state.turned_rad
+
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         self._call("move", self.command_of(reference))
         self.report.counters["arm.commands_given"] += 1

@@ -69,7 +69,10 @@ def arm_spec(kinematics: Kinematics, fingers: Sequence[str]) -> mujoco.MjSpec:
             data=line,
         )
     for index, name in enumerate(kinematics.arm_joints):
-        spec.joint(name).range = kinematics.lower_rad[index], kinematics.upper_rad[index]
+        made = spec.joint(name)
+        made.limited = not kinematics.endless[index]
+        if made.limited:
+            made.range = kinematics.lower_rad[index], kinematics.upper_rad[index]
     for name in moving:
         # Of the effort of a description, which is often made up, an arm would fall.
         spec.joint(name).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE

@@ -42,6 +42,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vla_zenoh.policy.meaning import nearest_turn
 from vla_zenoh.simulation.robot_model import JointGains
 from vla_zenoh.types import FloatArray, JointReference, PoseReference
 
@@ -152,6 +153,7 @@ class CartesianImpedance(_Impedance):
         self.gains = gains
         self._soft_lower_rad = np.asarray(lower_rad, float) + gains.limit_margin_rad
         self._soft_upper_rad = np.asarray(upper_rad, float) - gains.limit_margin_rad
+        self._endless = np.isinf(self._soft_upper_rad)
         self._posture_rad = np.array(posture_rad, float)
         self._posture_damping = 2.0 * math.sqrt(gains.posture_nm_rad)
         self._stiffness = np.repeat([gains.translational_n_m, gains.rotational_nm_rad], 3)
@@ -224,8 +226,12 @@ class CartesianImpedance(_Impedance):
     def _posture_torque(self, state: ArmDynamics) -> FloatArray:
         position = state.position_rad
         inside = np.minimum(np.maximum(position, self._soft_lower_rad), self._soft_upper_rad)
+        posture_rad = self._posture_rad
+        if self._endless.any():
+            nearest_rad = nearest_turn(posture_rad, position)
+            posture_rad = np.where(self._endless, nearest_rad, posture_rad)
         return (
-            self.gains.posture_nm_rad * (self._posture_rad - position)
+            self.gains.posture_nm_rad * (posture_rad - position)
             - self._posture_damping * state.velocity_rad_s
             + self.gains.limit_nm_rad * (inside - position)
         )

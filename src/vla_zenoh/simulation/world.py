@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property
@@ -291,8 +292,14 @@ class SimulatedPart:
         self._inertia = np.zeros((model.nv, model.nv))
         self._scratch = mujoco.MjData(model)
 
-        lower_rad, upper_rad = np.array([joint.range for joint in joints]).T
-        self.joint_range_rad = lower_rad, upper_rad  # (n,) each
+        dofs = np.array([joint.id for joint in joints])
+        endless = model.jnt_limited[dofs] == 0
+        lower_rad, upper_rad = model.jnt_range[dofs].T
+        self.joint_range_rad = (  # (n,) each
+            np.where(endless, -np.inf, lower_rad),
+            np.where(endless, np.inf, upper_rad),
+        )
+        self._endless = tuple(itertools.compress(robot.arm_joints, endless))
 
     def reset(self) -> None:
         """Put the joints at home, at rest, with the gripper open."""
@@ -430,7 +437,12 @@ class SimulatedPart:
         measured_rad = self._position_rad
         held_rad = measured_rad if self._held_rad is None else self._held_rad
         return JointState(
-            self.robot.arm_joints, measured_rad, self._velocity_rad_s, self._effort_nm, held_rad
+            self.robot.arm_joints,
+            measured_rad,
+            self._velocity_rad_s,
+            self._effort_nm,
+            held_rad,
+            self._endless,
         )
 
     def tcp(self) -> tuple[FloatArray, FloatArray]:

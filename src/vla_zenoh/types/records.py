@@ -68,6 +68,8 @@ class JointState(Record):
             does not measure it.
         reference_rad: (n,) positions the robot's controller holds right now, or None if it holds
             none or the robot does not report them.
+        endless: those of `names` that turn without an end. Their positions are counted over turns,
+            from within (-pi, pi] at the start of the robot's node.
     """
 
     names: Names
@@ -75,9 +77,12 @@ class JointState(Record):
     velocity_rad_s: PerJoint
     effort_nm: PerJoint | None
     reference_rad: PerJoint | None = None
+    endless: Names = ()
 
     def _check(self) -> None:
         check_per_joint(self)
+        if unknown := set(self.endless) - set(self.names):
+            raise RecordError(f"endless has {', '.join(unknown)}, allowed: some of names")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

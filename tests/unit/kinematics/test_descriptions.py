@@ -185,9 +185,9 @@ REFUSED: dict[str, Refused] = {
     "a type that is unknown": Refused(
         WHOLE.replace('type="revolute"', 'type="hinge"', 1), ("joint 'j1' of type 'hinge'",)
     ),
-    "a wrist without limits": Refused(
+    "an endless wrist without a velocity": Refused(
         urdf([*arm(SIX, j6=Row("j6", kind="continuous", limit="")), TOOL]),
-        ("'j6'", "continuous", "make it revolute"),
+        ("'j6'", "velocity > 0"),
     ),
     "a torso that nobody named": Refused(
         urdf([SLIDE, *arm(SIX), TOOL]), ("'lift'", "locked_rad: {lift: 0.0}")

@@ -148,14 +148,14 @@ def test_a_wrong_name_is_refused_with_the_nearest(
         Kinematics(URDF, tcp_frame, joints, FINGER_JOINTS)
 
 
-def test_a_joint_without_limits_is_refused(tmp_path: Path) -> None:
-    broken = tmp_path / "endless.urdf"
+def test_a_joint_that_floats_is_refused(tmp_path: Path) -> None:
+    broken = tmp_path / "floating.urdf"
     text = URDF.read_text()
     start = text.index('<joint name="panda_joint1"')
     end = text.index("</joint>", start)
-    joint = text[start:end].replace('type="revolute"', 'type="continuous"')
+    joint = text[start:end].replace('type="revolute"', 'type="floating"')
     broken.write_text(text[:start] + joint + text[end:])
-    with pytest.raises(ProfileError, match="is continuous; only joints with limits are supported"):
+    with pytest.raises(ProfileError, match="is floating: an arm's joint turns about"):
         Kinematics(broken, TCP_FRAME, ARM_JOINTS, FINGER_JOINTS)
 
 

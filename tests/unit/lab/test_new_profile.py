@@ -145,7 +145,7 @@ def mended(folder: Path, text: str) -> tuple[Description, Mended]:
     source.write_text(text)
     made = Mended(source, {}, folder)
     made.described()
-    made.give_ends(JOINTS_6)
+    made.complete(JOINTS_6, FINGERS)
     return Description(made.save(folder / "copy.urdf")), made
 
 
@@ -156,13 +156,33 @@ def test_what_lacks_nothing_is_used_as_it_is(tmp_path: Path) -> None:
     assert not (tmp_path / "copy.urdf").exists()
 
 
-def test_an_endless_joint_of_the_arm_gets_ends_and_a_wheel_does_not(tmp_path: Path) -> None:
-    endless = Row("j6", kind="continuous", limit='<limit effort="5" velocity="2"/>')
+TURNS = '<limit effort="5" velocity="2"/>'
+FINGERS = ("thumb",)
+
+
+def test_an_endless_joint_of_the_arm_stays_endless(tmp_path: Path) -> None:
+    endless = Row("j6", kind="continuous", limit=TURNS)
     wheel = Row("wheel", parent="base", kind="continuous", limit="")
     found, made = mended(tmp_path, urdf([*arm(SIX, j6=endless), TOOL, wheel]))
-    assert (found.joints["j6"].lower, found.joints["j6"].upper) == pytest.approx((-3.1416, 3.1416))
-    assert "j6: endless" in made.changes[0]
-    assert "wheel" not in made.changes[0]
+    assert found.path.name == "arm.urdf", "nothing had to be mended"
+    assert (found.joints["j6"].lower, found.joints["j6"].upper) == (-np.inf, np.inf)
+    assert (made.changes, made.guesses) == ([], [])
+
+
+def test_an_endless_joint_of_a_finger_gets_ends(tmp_path: Path) -> None:
+    thumb = Row("thumb", kind="continuous", limit=TURNS)
+    found, made = mended(tmp_path, urdf([*arm(SIX), TOOL, thumb]))
+    ends = found.joints["thumb"].lower, found.joints["thumb"].upper
+    assert ends == pytest.approx((-3.1416, 3.1416))
+    assert "thumb: endless" in made.changes[0]
+
+
+def test_an_endless_joint_without_a_velocity_gets_one_as_a_guess(tmp_path: Path) -> None:
+    endless = Row("j6", kind="continuous", limit="")
+    found, made = mended(tmp_path, urdf([*arm(SIX, j6=endless), TOOL]))
+    assert found.joints["j6"].velocity == 1.0
+    assert found.joints["j6"].kind == "continuous"
+    assert "velocity of j6: 1 rad/s" in made.guesses[0]
 
 
 @pytest.mark.parametrize("limit", ["", '<limit lower="-2" upper="2" effort="0" velocity="0"/>'])
@@ -203,7 +223,7 @@ def test_a_description_without_any_shapes_gets_some(tmp_path: Path) -> None:
 
 
 def meshed(folder: Path) -> str:
-    """A description that lacks ends of a joint, one of whose shapes is a mesh below `folder`."""
+    """A description that lacks a velocity, one of whose shapes is a mesh below `folder`."""
     package = folder / "away"
     package.mkdir()
     corners = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
@@ -221,7 +241,7 @@ def test_a_mesh_is_found_wherever_the_copy_is(tmp_path: Path) -> None:
     source, copy = tmp_path / "arm.urdf", tmp_path / "elsewhere" / "copy.urdf"
     source.write_text(meshed(tmp_path))
     made = Mended(source, {}, tmp_path)
-    made.give_ends(JOINTS_6)
+    made.complete(JOINTS_6, FINGERS)
     copy.parent.mkdir()
     made.save(copy)
     assert str(tmp_path / "away" / "link.stl") in copy.read_text()

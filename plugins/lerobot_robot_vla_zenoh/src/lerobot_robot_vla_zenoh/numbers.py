@@ -15,6 +15,7 @@ from vla_zenoh import RemoteRobot
 from vla_zenoh.errors import ProfileError, VlaZenohError
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.policy import Observation
+from vla_zenoh.policy.meaning import joints_as
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, Task
 
@@ -68,7 +69,7 @@ class ArmNumbers:
             raise DeviceNotConnectedError(str(error)) from error
         seen = Observation(
             *(joint.header.stamp_wall_ns, joint.header.seq, Task(0, False, "", "", 1.0)),
-            joint=joint.record,
+            joint=joints_as(joint.record, self.action.turns),
             gripper=gripper.record,
         )
         return dict(zip(self.names, self._state.encode(seen).tolist(), strict=True))

@@ -158,7 +158,7 @@ def _poses_of_joints(
     before_rad, poses = start_rad, [arm.forward(start_rad)]
     for step in steps:
         ordered = arm.ordered(spec.joints, step[: spec.arm_size])
-        before_rad = step_joints(spec, ordered, before_rad, start_rad)
+        before_rad = step_joints(spec, ordered, before_rad, start_rad, arm.endless)
         poses.append(arm.forward(before_rad))
     return poses
 

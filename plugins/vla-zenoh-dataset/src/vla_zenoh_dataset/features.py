@@ -31,7 +31,7 @@ from vla_zenoh_policy_servers.state_vector import (
 from vla_zenoh.errors import RecordingError, SpecError
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation, StatePart
-from vla_zenoh.policy.meaning import ROTATION_FORMS, unturned
+from vla_zenoh.policy.meaning import ROTATION_FORMS, joints_as, unturned, wrapped
 from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Task
@@ -140,6 +140,8 @@ def in_lerobots_numbers(spec: ActionSpec) -> bool:
 def worker_options(spec: ActionSpec, profile: Profile) -> dict[str, str]:
     """What the actions of one arm mean in a dataset, as options of the worker ``lerobot``."""
     options = {"dt_s": repr(spec.dt_s), "gripper": spec.gripper}
+    if spec.turns == "counted":
+        options["joint_turns"] = spec.turns
     if in_lerobots_numbers(spec):
         grips = spec.gripper != "none"
         options |= {each: LEROBOT[each] for each in LEROBOT if grips or "grip" not in each}
@@ -285,6 +287,11 @@ def actions_of(episode: RecordedEpisode) -> NDArray[np.float32]:
 
 
 def _actions(spec: ActionSpec, steps: NDArray[np.float32], run: Run, part: str) -> NDArray[Any]:
+    measured = run.of_part(part).joints
+    if spec.space == "joint" and spec.kind == "absolute" and spec.turns == "wrapped" and measured:
+        endless = np.flatnonzero(np.isin(spec.joints, measured[0].record.endless))
+        steps = steps.copy()
+        steps[:, endless] = wrapped(steps[:, endless])
     if not in_lerobots_numbers(spec):
         return steps
     rows = steps.astype(np.float64)
@@ -374,6 +381,9 @@ def _states(episode: RecordedEpisode, run: Run, numbers: StateNumbers) -> NDArra
                 )
             name = FIELD_OF.get(part, part)
             found[name] = near.record if part in streams else getattr(near.record, name)
+            if part == "joint":
+                turns = episode.spec.action.of(run.part).turns
+                found[name] = joints_as(near.record, turns)
             if found[name] is None:
                 raise RecordingError(f"{run.path}: its robot did not measure {part}")
         observation = Observation(frame.stamp_ns, 0, task, **found)

@@ -263,12 +263,12 @@ def _description(urdf: str, profile: Profile) -> Iterator[HostFinding]:
         file.flush()
         own = Kinematics(Path(file.name), links[0], joints)
     ours, random = make_kinematics(profile), np.random.default_rng(0)
-    middle_rad = (ours.lower_rad + ours.upper_rad) / 2
+    middle_rad = sum(ours.sampled_rad) / 2
     # (4, 4): our TCP in the frame of the flange.
     tool = np.linalg.inv(flange_pose(middle_rad)) @ _matrix(ours.forward(middle_rad))
     worst = Pose(np.zeros(3), np.eye(3)), Pose(np.zeros(3), np.eye(3))
     for _ in range(LOOKS):
-        joints_rad = random.uniform(ours.lower_rad, ours.upper_rad)
+        joints_rad = random.uniform(*ours.sampled_rad)
         there = _pose(_matrix(ours.forward(joints_rad)) @ np.linalg.inv(tool))
         pair = own.forward(joints_rad), there
         worst = max(worst, pair, key=lambda poses: pose_distance(*poses)[0])

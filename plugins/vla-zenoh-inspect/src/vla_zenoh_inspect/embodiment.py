@@ -27,6 +27,7 @@ import vla_zenoh
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.keys import worker_node
+from vla_zenoh.policy.meaning import joints_as
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh_inspect.targets import Targets
 
@@ -193,7 +194,7 @@ class Arm(EmbodimentBase):
             self._send(target)
             self._pace()
         give_up_s = time.monotonic() + SETTLE_S
-        while np.abs(self._measured() - home)[:-1].max() > SETTLED_RAD:
+        while np.abs(self._targets.apart(self._measured(), home))[:-1].max() > SETTLED_RAD:
             if time.monotonic() > give_up_s:
                 raise EmbodimentFault("the arm does not arrive at home: `vla-zenoh status` has why")
             self._driven()
@@ -201,7 +202,8 @@ class Arm(EmbodimentBase):
 
     def _measured(self) -> Numbers:
         assert self._robot is not None
-        joint, gripper = self._robot.joint_state().record, self._robot.gripper_state().record
+        joint = joints_as(self._robot.joint_state().record, "wrapped")
+        gripper = self._robot.gripper_state().record
         at = dict(zip(joint.names, joint.position_rad, strict=True))
         opening = gripper.kept_width_m / self._max_width_m
         joints = [float(at[name]) for name in self._profile.robot.arm_joints]

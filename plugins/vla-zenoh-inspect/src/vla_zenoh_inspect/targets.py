@@ -11,6 +11,7 @@ from vla_zenoh_primitives.target_check import TargetCheck
 
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.policy import ActionSpec
+from vla_zenoh.policy.meaning import wrapped
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 
@@ -28,7 +29,8 @@ class Targets:
 
     Attributes:
         labels: of the numbers: joints in the order of the profile, and the gripper.
-        low, high: (n + 1,) rad, of a joint that slides m; 0 (shut) to 1.
+        low, high: (n + 1,) rad, of a joint that slides m; 0 (shut) to 1. A joint that turns without
+            an end is between -pi and pi, and goes the shortest way.
         most: (n + 1,) change of one step that the arm can follow.
     """
 
@@ -40,8 +42,9 @@ class Targets:
         self._order = [kinematics.arm_joints.index(name) for name in names]
         self._back = np.argsort(self._order)
         self.labels = (*names, GRIPPER)
-        self.low = np.array([*bounds.lower_rad[self._order], 0.0])
-        self.high = np.array([*bounds.upper_rad[self._order], 1.0])
+        self._endless = np.array([*kinematics.endless[self._order], False])
+        self.low = np.where(self._endless, -np.pi, [*bounds.lower_rad[self._order], 0.0])
+        self.high = np.where(self._endless, np.pi, [*bounds.upper_rad[self._order], 1.0])
         given = np.asarray(profile.limits.joint.velocity_rad_s, float)
         speed_rad_s = np.broadcast_to(given, (len(names),))
         self.most = np.array([*(SHARE * speed_rad_s / rate_hz), 1.0])
@@ -72,6 +75,11 @@ class Targets:
 
     def way(self, here: FloatArray, target: FloatArray) -> NDArray[np.float64]:
         """(k, n + 1) steps straight to `target` that the arm can follow."""
-        count = max(1, int(np.ceil(np.max(np.abs(target - here) / self.most))))
+        way = self.apart(here, target)
+        count = max(1, int(np.ceil(np.max(np.abs(way) / self.most))))
         shares = np.arange(1, count + 1)[:, None] / count
-        return here + shares * (target - here)
+        return here + shares * way
+
+    def apart(self, here: FloatArray, target: FloatArray) -> FloatArray:
+        """(n + 1,) from `here` to `target`."""
+        return np.where(self._endless, wrapped(target - here), target - here)

@@ -11,6 +11,7 @@ velocity nor torque.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Mapping
 from dataclasses import fields
@@ -55,6 +56,11 @@ class LeRobotArm:
             kinematics = make_kinematics(profile)
             order = [kinematics.arm_joints.index(name) for name in names]
             lower, upper = kinematics.lower_rad[order], kinematics.upper_rad[order]
+            if endless := list(itertools.compress(names, kinematics.endless[order])):
+                raise NodeError(
+                    f"{', '.join(endless)} turns without an end: normalised units need two; set "
+                    "lerobot.units: degrees"
+                )
             self._unit_rad = sign * (upper - lower) / 200
             self._zero = -(upper + lower) / 2 / self._unit_rad
         self._robot: Any = None

@@ -19,6 +19,7 @@ from vla_zenoh.client.primitives import ask
 from vla_zenoh.client.remote_robot import RemoteRobot
 from vla_zenoh.errors import SessionError, VlaZenohError, in_words
 from vla_zenoh.keys import worker_node
+from vla_zenoh.policy.meaning import joints_as
 from vla_zenoh_mcp.protocol import (
     DESCRIPTIONS,
     LOOKING,
@@ -150,6 +151,7 @@ class McpServer:
             raise SessionError(
                 f"{error}; the command node is {state}{why and f': {why}'}"
             ) from None
+        joints_rad = joints_as(joint, "wrapped").position_rad
         box = robot.profile.limits.tcp_box
         worker = worker_node("")
         fields = {
@@ -161,7 +163,7 @@ class McpServer:
             "prompt": task.prompt if task is not None else "",
             "position_m": pose.position_m.tolist(),
             "quat_xyzw": pose.quat_xyzw.tolist(),
-            "joints_rad": dict(zip(joint.names, joint.position_rad.tolist(), strict=True)),
+            "joints_rad": dict(zip(joint.names, joints_rad.tolist(), strict=True)),
             "gripper": None
             if gripper.width_m is None
             else {

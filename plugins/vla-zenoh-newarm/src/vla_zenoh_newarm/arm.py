@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -40,7 +41,7 @@ class Arm(NamedTuple):
         posture: its home and workspace.
         motion: limits of its joints.
         table_z_m: height of the table; None: there is none.
-        changes: what was changed in the description.
+        changes: what was changed in the description, and what is unusual in it.
         guesses: what nobody has confirmed.
     """
 
@@ -74,7 +75,7 @@ def found_arm(source: Path, copy: Path, arguments: Mapping[str, str], answers: A
     """
     description = Mended(source, arguments, meshes_of(copy))
     links = _structure(description, answers)
-    description.give_ends([*links.arm, *links.fingers])
+    description.complete(links.arm, links.fingers)
     file = description.save(copy)
     for made_up in description.guesses:
         answers.guesses.append(Guess("robot.description", made_up))
@@ -87,6 +88,9 @@ def found_arm(source: Path, copy: Path, arguments: Mapping[str, str], answers: A
     home = posture_of(kinematics, table_z_m, answers)
     motion = _motion(kinematics, answers)
     changes = [*description.changes, *([hand.why] if hand.why else [])]
+    if kinematics.endless.any():
+        endless = ", ".join(itertools.compress(kinematics.arm_joints, kinematics.endless))
+        changes.append(f"{endless}: no end, counted over turns; joint_range_rad gives one")
     return Arm(file, links, hand, home, motion, table_z_m, changes, answers.guesses)
 
 

@@ -1,7 +1,8 @@
 """A robot description (URDF, xacro or MJCF) with what we need and descriptions often lack.
 
-Endless joints get ends, joints without a velocity get one, meshes that cannot be found are replaced
-by plain shapes. What was changed is said; a description that lacks nothing is used as it is.
+Joints without a velocity get one, endless joints of fingers get ends, meshes that cannot be found
+are replaced by plain shapes. What was changed is said; a description that lacks nothing is used as
+it is.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from vla_zenoh.kinematics.description import Description, is_xacro
 from vla_zenoh.types import FloatArray
 
 ENDLESS_RAD = 3.1416
-"""End of the range of an endless joint, to both sides: no reading of it ever jumps by a turn."""
+"""End of the range of an endless joint of a finger, to both sides."""
 SLOW_RAD_S, SLOW_M_S = 1.0, 0.1
 """Velocity of a joint that has none."""
 THIN_M, THICK_M = 0.02, 0.05
@@ -81,12 +82,12 @@ class Mended:
             self._write(path)
             return Description(path)
 
-    def give_ends(self, joints: Collection[str]) -> None:
-        """Give those of `joints` that turn endlessly ends, and a velocity."""
-        endless = list(_give_ends(self._robot, joints))
+    def complete(self, arm: Collection[str], fingers: Collection[str]) -> None:
+        """Give those joints that turn endlessly a velocity, and those of `fingers` ends."""
+        endless = list(_give_ends(self._robot, fingers))
         if endless:
             self.changes.append(f"{', '.join(endless)}: endless, here from -pi to pi")
-            self.guesses += _give_velocities(self._robot)
+        self.guesses += _give_velocities(self._robot, {*arm, *fingers})
 
     def save(self, copy: Path) -> Path:
         """The description to use: the given file, or where something was changed, a copy."""
@@ -169,10 +170,12 @@ def _give_ends(robot: ElementTree.Element, joints: Collection[str]) -> Iterator[
         yield str(joint.get("name"))
 
 
-def _give_velocities(robot: ElementTree.Element) -> Iterator[str]:
+def _give_velocities(robot: ElementTree.Element, endless: Collection[str] = ()) -> Iterator[str]:
+    """Of joints with a range, and of those that are `endless`."""
     lacking: list[str] = []
     for joint in robot.findall("joint"):
-        if joint.get("type") not in ("revolute", "prismatic"):
+        given = joint.get("type") in ("revolute", "prismatic")
+        if not given and not (joint.get("type") == "continuous" and joint.get("name") in endless):
             continue
         limit = _limit(joint)
         limit.set("effort", limit.get("effort", "10"))

@@ -36,8 +36,9 @@ ABOVE_M = 0.012
 """A workspace begins this far above the table."""
 MARGIN_M = 0.1
 """Of a workspace around home, at least."""
-ENDLESS_RAD = 3.0
-"""Ranges beyond this are looked at up to here: half a turn has every direction."""
+FARTHEST_RAD = 3.0
+"""Ranges beyond this, and joints without an end, are looked at up to here: half a turn has every
+direction."""
 
 Span = tuple[float, float]
 
@@ -67,8 +68,8 @@ def posture(kinematics: Kinematics, reach: ReachLimits, home_rad: Sequence[float
         ResourceError: the shapes of its description cannot be loaded.
     """
     random = np.random.default_rng(0)  # the same profile every time
-    low = np.maximum(kinematics.lower_rad, -ENDLESS_RAD)
-    high = np.minimum(kinematics.upper_rad, ENDLESS_RAD)
+    low = np.maximum(kinematics.lower_rad, -FARTHEST_RAD)
+    high = np.minimum(kinematics.upper_rad, FARTHEST_RAD)
     middle, half = (low + high) / 2, (high - low) / 2
     shares = random.uniform(-1.0, 1.0, (SAMPLES, kinematics.size))
     places_m = np.array([kinematics.forward(middle + half * each).position_m for each in shares])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -73,7 +74,7 @@ class Layout:
             kinematics = make_kinematics(profile)
             order = [kinematics.arm_joints.index(name) for name in ours]
             lower_rad, upper_rad = kinematics.lower_rad[order], kinematics.upper_rad[order]
-            endless = [n for n, to in zip(ours, upper_rad - lower_rad, strict=True) if to > 100]
+            endless = list(itertools.compress(ours, kinematics.endless[order]))
             if len(zero):
                 raise NodeError("zero is given, but normalised joints have theirs by their ends")
             if endless:

@@ -24,6 +24,8 @@ units it wants the state (`vla_zenoh_policy_servers.state_vector`)::
                negative for a joint that turns the other way; or one for each joint, with commas, m
                for a joint that slides; of joint_position also that of `joint` in the state
     joint_zero its number where a joint of the profile is at 0, default 0; or one for each
+    joint_turns        wrapped, counted: joints that turn without an end are within half a turn of
+               the profile's zero, or counted over turns; also those in the state
     gripper    none, delta_m, absolute_m, open_fraction, binary
     gripper_open       high, low: which end of binary and open_fraction is open
     gripper_range      SHUT:OPEN, the numbers of open_fraction where it is shut and open, in place
@@ -85,6 +87,7 @@ ACTION_OPTIONS: Mapping[str, str] = {
     "rotation_scale_rad": "1",
     "joint_scale_rad": "",
     "joint_zero": "0",
+    "joint_turns": "wrapped",
     "gripper": "",
     "gripper_open": "",
     "gripper_range": "",
@@ -104,6 +107,7 @@ _ALLOWED: Mapping[str, tuple[str, ...]] = {
     "frame": get_args(Frame),
     "anchor": get_args(Anchor),
     "relative_to": get_args(RelativeTo),
+    "joint_turns": ("wrapped", "counted"),
     "gripper": get_args(GripperSemantics),
     "gripper_open": ("high", "low"),
 }
@@ -417,6 +421,7 @@ def _spec(
                 "horizon": whole_number("horizon", chosen["horizon"]),
                 "dt_s": number("dt_s", chosen["dt_s"]),
                 "kind": _JOINT_KINDS.get(action, action),
+                "turns": chosen["joint_turns"],
                 "space": "joint" if action in _JOINT_KINDS else "tcp",
                 "joints": tuple(joints) if action in _JOINT_KINDS else (),
                 "frame": chosen["frame"],

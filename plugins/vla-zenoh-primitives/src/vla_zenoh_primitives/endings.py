@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of
 from vla_zenoh.types import FloatArray, GripperState, PoseState
 from vla_zenoh_primitives.requests import Until
@@ -57,18 +58,24 @@ class Arrival:
         pose: target of the TCP.
         joints_rad: (n,) joint target in the order of the kinematics; None: only the pose is
             checked.
+        arm: of these joints; None: none of them turns without an end.
     """
 
-    def __init__(self, pose: Pose, joints_rad: FloatArray | None = None) -> None:
-        self.pose, self.joints_rad = pose, joints_rad
+    def __init__(
+        self, pose: Pose, joints_rad: FloatArray | None = None, arm: Kinematics | None = None
+    ) -> None:
+        self.pose, self.joints_rad, self._arm = pose, joints_rad, arm
         self._best = np.inf
         self._gained_s = self._there_s = -np.inf
 
     def off(self, sight: Sight) -> tuple[float, float]:
         """Distance of the TCP from the target, m; its angle, or the largest joint error, rad."""
         off_m, off_rad = pose_distance(pose_of(sight.pose), self.pose)
-        if self.joints_rad is not None:
-            off_rad = float(np.abs(sight.joints_rad - self.joints_rad).max())
+        target_rad = self.joints_rad
+        if target_rad is not None:
+            if self._arm is not None:
+                target_rad = self._arm.nearest(target_rad, sight.joints_rad)
+            off_rad = float(np.abs(sight.joints_rad - target_rad).max())
         return off_m, off_rad
 
     def check(self, sight: Sight) -> str:

@@ -27,6 +27,7 @@ from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
 from vla_zenoh.nodes.worker.node import InferenceDebugPublisher
 from vla_zenoh.nodes.worker.robot_session import RobotSession
+from vla_zenoh.policy.meaning import joints_as, wrapped
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, HeldBox
 from vla_zenoh_primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
@@ -298,8 +299,9 @@ class PrimitivesNode:
         if isinstance(joints_rad, dict):
             if unknown := [name for name in joints_rad if name not in names]:
                 raise Rejected(f"joints_rad: no joint {unknown[0]!r}; there are {', '.join(names)}")
-            chain = self._check.kinematics.arm_joints
-            now = dict(zip(chain, sight.joints_rad.tolist(), strict=True))
+            arm = self._check.kinematics
+            here_rad = np.where(arm.endless, wrapped(sight.joints_rad), sight.joints_rad)
+            now = dict(zip(arm.arm_joints, here_rad.tolist(), strict=True))
             return np.array([{**now, **joints_rad}[name] for name in names])
         if len(joints_rad) != len(names):
             raise Rejected(
@@ -315,15 +317,17 @@ class PrimitivesNode:
             raise Rejected(why)
         # An arm commanded by poses leaves the elbow to its own controller.
         judged = chain_rad if self._profile.robot.command == "joint" else None
-        return Arrival(kinematics.forward(chain_rad), judged), Target(joints_rad=joints_rad)
+        arrival = Arrival(kinematics.forward(chain_rad), judged, kinematics)
+        return arrival, Target(joints_rad=joints_rad)
 
     def _elbow(self, target: Target) -> str:
         """How far an arm commanded by poses is from the requested joints."""
         if target.joints_rad is None or self._profile.robot.command == "joint":
             return ""
         names = self._profile.robot.arm_joints
-        asked_rad = self._check.kinematics.ordered(names, target.joints_rad)
-        off_rad = float(np.abs(self._sight().joints_rad - asked_rad).max())
+        here_rad, arm = self._sight().joints_rad, self._check.kinematics
+        asked_rad = arm.nearest(arm.ordered(names, target.joints_rad), here_rad)
+        off_rad = float(np.abs(here_rad - asked_rad).max())
         return (
             f"this robot takes poses: the TCP is where these joints place it, the joints are up to "
             f"{off_rad:.2g} rad away, because its controller keeps the elbow"
@@ -439,7 +443,8 @@ class PrimitivesNode:
     def _standing(self) -> Answer:
         """An answer with the state of the arm."""
         try:
-            pose, joint = self._robot.pose_state().record, self._robot.joint_state().record
+            pose = self._robot.pose_state().record
+            joint = joints_as(self._robot.joint_state().record, "wrapped")
             gripper = self._robot.gripper_state().record
         except VlaZenohError:
             return Answer(False, "")

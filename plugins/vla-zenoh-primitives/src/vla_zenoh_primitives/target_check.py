@@ -62,7 +62,8 @@ class TargetCheck:
         return ""
 
     def joints_fault(self, joints_rad: FloatArray, target_rad: FloatArray) -> str:
-        """The same of a straight motion of the joints to `target_rad` (n,)."""
+        """The same of a straight motion of the joints to `target_rad` (n,), on the shortest way."""
+        target_rad = self.kinematics.nearest(target_rad, joints_rad)
         lower_rad, upper_rad = self.bounds.lower_rad, self.bounds.upper_rad
         names = self.kinematics.arm_joints
         for index, name in enumerate(names):

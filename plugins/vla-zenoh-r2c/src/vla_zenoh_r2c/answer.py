@@ -7,6 +7,7 @@ where a step leaves the range of a joint, or is faster than ``limits.joint`` all
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -18,6 +19,7 @@ from vla_zenoh.kinematics.kinematics import InverseKinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import ChunkPrefix
+from vla_zenoh.policy.meaning import joints_as
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState, Task
@@ -126,7 +128,9 @@ class Answers:
             raise CodecError("task", "task is empty, and the model needs a prompt")
         still, state = np.zeros(len(joints_rad)), dict[str, Any]()
         if "joint" in spec.state:
-            state["joint"] = JointState(self._joints, joints_rad, still, still)
+            endless = itertools.compress(self._joints, self._kinematics.endless[self._in_profile])
+            measured = JointState(self._joints, joints_rad, still, still, endless=tuple(endless))
+            state["joint"] = joints_as(measured, self._policy.spec.action.turns)
         if "gripper" in spec.state:
             state["gripper"] = GripperState(width_m, moving=False, holding=False)
         if "pose" in spec.state:
@@ -162,9 +166,11 @@ class Answers:
             order = [action.joints.index(name) for name in self._joints]
             first_rad = np.empty(len(order))
             first_rad[order] = start_rad
+            endless = np.empty(len(order), bool)
+            endless[order] = self._kinematics.endless[self._in_profile]
             before_rad = first_rad
             for step in steps:
-                before_rad = step_joints(action, step, before_rad, first_rad)
+                before_rad = step_joints(action, step, before_rad, first_rad, endless)
                 rows.append(before_rad[order])
             return np.array(rows), np.array(widths_m)
         here_rad = start_rad[self._in_chain]

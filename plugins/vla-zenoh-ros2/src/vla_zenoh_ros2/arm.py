@@ -142,6 +142,10 @@ class Ros2Arm(RobotDriver):
             self._stay(measured, self._node.clock.wall_at(mono_ns))
         return measured._replace(gripper=self._gripper_state(stamp_ns))
 
+    @property
+    def turned_rad(self) -> FloatArray:
+        return self.states.state.turned_rad
+
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Publish a set-point."""
         command = self.command_of(reference)

@@ -23,6 +23,7 @@ from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import orthonormal, pose_of, quat_from_rotation
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.loader import make_robot
+from vla_zenoh.policy.meaning import wrapped
 from vla_zenoh.policy.spec import PERSON
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import numbers
@@ -164,7 +165,8 @@ class LeaderPolicy:
         self._leads = leads
         times_s = self._now_s() - period_s + DT_S * np.arange(1, count + 1)
         stamps = np.array([state.time_s for state in path])
-        columns = np.array([state.position_rad for state in path]).T
+        # No joint turns by half a turn between two readings: the leader wraps its numbers there.
+        columns = np.unwrap([state.position_rad for state in path], axis=0).T
         joints_rad = np.column_stack([np.interp(times_s, stamps, column) for column in columns])
         width_m = self._width(path[-1].width_m) if leads else self._width_m
         width = [width_m] if self._grips else []
@@ -194,17 +196,20 @@ class _Joints:
             horizon=HORIZON, dt_s=DT_S, kind="absolute", space="joint", joints=self._joints
         )
         self._apart_rad: FloatArray = np.zeros(len(self._joints))
+        self._endless = np.zeros(len(self._joints), bool)
 
     def begin(self, observation: Observation, leader_rad: FloatArray) -> None:
         """Note how far the arm is from the leader, (n,) rad."""
         joint = observation.joint
         assert joint is not None
         measured = dict(zip(joint.names, joint.position_rad, strict=True))
+        self._endless = np.isin(self._joints, joint.endless)
         self._apart_rad = np.array([measured[name] for name in self._joints]) - leader_rad
 
     def step(self, leader_rad: FloatArray) -> FloatArray:
         """(n,) joints of the arm for those of the leader."""
-        return leader_rad + self._apart_rad
+        target_rad = leader_rad + self._apart_rad
+        return np.where(self._endless, wrapped(target_rad), target_rad)
 
 
 class _Tcp:

@@ -104,9 +104,11 @@ class ArmLines:
         if set(action.joints) != set(self._kinematics.arm_joints):
             raise RecordError("its joints are not those of the arm")
         order = [action.joints.index(name) for name in self._kinematics.arm_joints]
-        before = anchor = first[np.argsort(order)]
+        there = np.argsort(order)
+        before = anchor = first[there]
+        endless = self._kinematics.endless[there]
         line = [self._kinematics.forward(first).position_m]
         for step in steps:
-            before = step_joints(action, np.asarray(step, np.float64), before, anchor)
+            before = step_joints(action, np.asarray(step, np.float64), before, anchor, endless)
             line.append(self._kinematics.forward(before[order]).position_m)
         return rounded(line)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -160,7 +161,10 @@ def table_advice(profile: Profile) -> Iterator[str]:
 
 
 def joints_advice(profile: Profile) -> Iterator[str]:
-    """What the check assumes of joints that are not commanded, of home, and of too few joints."""
+    """What the check assumes of joints that are not commanded, of home, and of too few joints.
+
+    And which have no end.
+    """
     reach = _reach(profile)
     if reach is None:
         return
@@ -177,6 +181,12 @@ def joints_advice(profile: Profile) -> Iterator[str]:
             f"robot.locked_rad: {name} is not commanded, and every pose assumes it at {value:g}. "
             "States that have it elsewhere are rejected; a robot that does not publish it is "
             "believed"
+        )
+    if kinematics.endless.any():
+        endless = ", ".join(compress(kinematics.arm_joints, kinematics.endless))
+        yield (
+            f"robot.arm_joints: no end, and the shortest way to every target: {endless}. "
+            "robot.joint_range_rad gives them one"
         )
     yield from _fingers_advice(profile, kinematics.fingers_m)
     where, outside_m = _home_tcp(profile, reach)
@@ -205,12 +215,8 @@ def _axes_advice(kinematics: Kinematics) -> Iterator[str]:
     import numpy as np
 
     random = np.random.default_rng(1)
-    span_rad = kinematics.upper_rad - kinematics.lower_rad
-    shares = random.random((POSTURES, kinematics.size))
-    most = max(
-        np.linalg.matrix_rank(kinematics.jacobian(kinematics.lower_rad + share * span_rad), 1e-6)
-        for share in shares
-    )
+    postures = random.uniform(*kinematics.sampled_rad, (POSTURES, kinematics.size))
+    most = max(np.linalg.matrix_rank(kinematics.jacobian(each), 1e-6) for each in postures)
     if most < POSE_JOINTS:
         yield (
             f"robot.arm_joints: {kinematics.size} joints move the TCP in {most} of six directions "

@@ -399,15 +399,15 @@ def _part_detail(part: CommandedPart) -> dict[str, Any]:
             detail["goal_width_m"] = round(goal.width_m, 5)
     if reach is not None and goal is not None:
         room = reach.margins
-        detail["joint_margin_rad"] = round(room.joint_rad, 4)
         detail["joint_margin_of"] = room.joint
         detail["singular_value"] = round(room.singular_value, 4)
-        for name, far_m in (
+        for name, room_left in (
+            ("joint_margin_rad", room.joint_rad),
             ("self_distance_m", room.self_m),
             ("table_distance_m", room.table_m),
             ("keep_out_distance_m", room.keep_out_m),
         ):
-            detail[name] = round(far_m, 4) if math.isfinite(far_m) else None
+            detail[name] = round(room_left, 4) if math.isfinite(room_left) else None
     force_n, torque_nm = contact.force_n, contact.torque_nm
     detail["external_force_n"] = None if force_n is None else round(force_n, 2)
     detail["external_torque_nm"] = None if torque_nm is None else round(torque_nm, 2)

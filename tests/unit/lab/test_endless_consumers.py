@@ -1,0 +1,153 @@
+"""Everything that computes with the ranges of joints is right where a joint has no end.
+
+Numpy's warnings are errors here: an infinite range that becomes no number fails a test.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from endless_arm import ENDLESS, HOME_RAD, endless_arm
+from vla_zenoh_conform.rules import RuleFinding, _joints
+from vla_zenoh_inspect.targets import Targets
+from vla_zenoh_lerobot.arm import LeRobotArm
+from vla_zenoh_lerobot.plugin import LeRobotOptions
+from vla_zenoh_newarm.posture import posture
+from vla_zenoh_physicalai.layout import Layout
+from vla_zenoh_primitives.endings import Arrival, Sight
+from vla_zenoh_primitives.target_check import TargetCheck
+
+from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.errors import NodeError
+from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
+from vla_zenoh.lab.profile.robot_check import arm as check_arm
+from vla_zenoh.lab.profile.robot_check import joints_advice
+from vla_zenoh.profile import Profile, override
+from vla_zenoh.types import GripperState, JointState, PoseState
+
+ROOT = Path(__file__).parents[3]
+HOME = np.array(HOME_RAD)
+TURN = 2 * math.pi
+AWAY = HOME + np.array([0, 0, 0, 0, 0, 5]) * TURN
+
+HERE = "unit/lab/test_endless_consumers.py"
+FIXED = "an arm of one maker, whose joints all have ends"
+TRIED = {
+    "src/vla_zenoh/control/joint_follower.py": "sim/test_endless_joints.py",
+    "src/vla_zenoh/control/joint_space.py": "unit/control/test_endless_targets.py",
+    "src/vla_zenoh/control/reachability.py": "unit/kinematics/test_endless_ranges.py",
+    "src/vla_zenoh/control/watchdog.py": "sim/test_endless_joints.py",
+    "src/vla_zenoh/guard/stream_guard.py": "sim/test_endless_joints.py",
+    "src/vla_zenoh/kinematics/collision.py": "unit/kinematics/test_endless_ranges.py",
+    "src/vla_zenoh/kinematics/kinematics.py": "unit/kinematics/test_endless_ranges.py",
+    "src/vla_zenoh/kinematics/plausibility.py": "unit/kinematics/test_endless_ranges.py",
+    "src/vla_zenoh/lab/profile/robot_check.py": HERE,
+    "src/vla_zenoh/robots/driver.py": "unit/ros2/test_ros2_endless.py",
+    "src/vla_zenoh/simulation/any_arm.py": "sim/test_endless_joints.py",
+    "src/vla_zenoh/simulation/impedance.py": "sim/test_endless_joints.py",
+    "src/vla_zenoh/simulation/world.py": "sim/test_endless_joints.py",
+    "plugins/lerobot_robot_vla_zenoh/src/lerobot_robot_vla_zenoh/numbers.py": "clips to its ends",
+    "plugins/vla-zenoh-conform/src/vla_zenoh_conform/rules.py": HERE,
+    "plugins/vla-zenoh-franka/src/vla_zenoh_franka/check.py": FIXED,
+    "plugins/vla-zenoh-inspect/src/vla_zenoh_inspect/targets.py": HERE,
+    "plugins/vla-zenoh-lerobot/src/vla_zenoh_lerobot/arm.py": HERE,
+    "plugins/vla-zenoh-newarm/src/vla_zenoh_newarm/posture.py": HERE,
+    "plugins/vla-zenoh-physicalai/src/vla_zenoh_physicalai/layout.py": HERE,
+    "plugins/vla-zenoh-primitives/src/vla_zenoh_primitives/target_check.py": HERE,
+    "plugins/vla-zenoh-r2c/src/vla_zenoh_r2c/answer.py": "compares with its ends",
+    "plugins/vla-zenoh-trossen/src/vla_zenoh_trossen/arm.py": FIXED,
+    "plugins/vla-zenoh-trossen/src/vla_zenoh_trossen/bounds.py": FIXED,
+}
+"""File that reads the ends of ranges -> the test of it with joints that have none, or why not."""
+
+
+def test_every_file_that_reads_the_ends_of_ranges_is_tried_without_them() -> None:
+    found = {
+        str(file.relative_to(ROOT))
+        for folder in ("src", "plugins")
+        for file in (ROOT / folder).rglob("*.py")
+        if ".venv" not in file.parts and ".upper_rad" in file.read_text()
+    }
+    # These are given the ends by others.
+    inner = ("guard/stream_guard", "simulation/impedance", "simulation/world")
+    found |= {f"src/vla_zenoh/{name}.py" for name in inner}
+    assert found == TRIED.keys()
+    tests = [test for test in TRIED.values() if test.endswith(".py")]
+    assert all((ROOT / "tests" / test).exists() for test in tests)
+
+
+@pytest.fixture
+def profile(tmp_path: Path) -> Profile:
+    return endless_arm(tmp_path)
+
+
+def test_the_check_of_a_profile_finds_nothing_wrong(profile: Profile) -> None:
+    assert not list(check_arm(profile))
+    assert any(
+        "no end" in why and "joint1, joint4, joint6" in why for why in joints_advice(profile)
+    )
+
+
+def test_a_home_is_found_within_a_turn(profile: Profile) -> None:
+    found = posture(make_kinematics(profile), profile.limits.reach, ())
+    assert np.isfinite(found.home_rad).all()
+    assert np.abs(found.home_rad).max() < math.pi
+
+
+def test_a_target_of_a_motion_is_checked_on_the_shortest_way(profile: Profile) -> None:
+    check = TargetCheck(profile, ReachabilityFilter(profile))
+    assert check.joints_fault(AWAY, HOME + 0.1) == ""
+    assert "joint_limit: joint2" in check.joints_fault(AWAY, HOME + [0, 9, 0, 0, 0, 0])
+
+
+def test_a_motion_is_over_where_its_target_is_after_some_turns(profile: Profile) -> None:
+    arm = make_kinematics(profile)
+    pose = arm.forward(HOME)
+    measured = PoseState(pose.position_m, quat_from_rotation(pose.rotation), np.zeros(6))
+    gripper = GripperState(None, moving=False, holding=False)
+    arrival = Arrival(Pose(*pose), HOME, arm)
+    checks = [arrival.check(Sight(now_s, measured, AWAY, gripper)) for now_s in (0.0, 1.0, 2.0)]
+    assert "reached" in checks
+
+
+def test_an_agent_is_told_a_turn_and_goes_the_shortest_way(tmp_path: Path) -> None:
+    gripper = {"max_width_m": 0.08, "joint_open_m": 0.04, "joint_shut_m": 0.0}
+    profile = endless_arm(tmp_path, robot={"gripper": gripper})
+    targets = Targets(profile, 10.0)
+    assert np.isfinite([targets.low, targets.high]).all()
+    assert (targets.high - targets.low)[[0, 3, 5]] == pytest.approx(TURN)
+    here, there = np.array([*AWAY, 0.5]), np.array([*HOME, 0.5])
+    there[5] += 0.3
+    assert targets.refusal(here, there) == ""
+    way = targets.way(here, there)
+    assert way[-1] == pytest.approx([*AWAY[:5], AWAY[5] + 0.3, 0.5])
+
+
+def test_joints_after_many_turns_conform(profile: Profile) -> None:
+    still = np.zeros(6)
+    state = JointState(profile.robot.arm_joints, AWAY, still, still, endless=ENDLESS)
+    findings: list[RuleFinding] = list(_joints([state], profile, make_kinematics(profile)))
+    assert all(finding.right for finding in findings), findings
+
+
+def test_units_from_end_to_end_need_ends(profile: Profile) -> None:
+    options = LeRobotOptions(robot="any", port="/dev/null", id="one", units="normalised")
+    without = override(profile, {"robot": {"gripper": None}})
+    with pytest.raises(NodeError, match="joint1, joint4, joint6 turns without an end"):
+        LeRobotArm(without, options.model_copy(update={"gripper": ""}))
+    names = profile.robot.arm_joints
+    with pytest.raises(NodeError, match="joint1, joint4, joint6 turns without end"):
+        Layout(
+            without,
+            names,
+            joints=names,
+            gripper="",
+            gripper_ends=(0.0, 1.0),
+            unit="normalised",
+            zero=(),
+            reversed=(),
+        )
