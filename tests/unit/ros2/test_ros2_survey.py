@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -31,6 +32,20 @@ JOINTS = tuple(f"j{n}" for n in range(1, 7))
 POSITION = (0.1, -0.2, 0.3, 0.0, 0.5, 0.0)
 LATCHED = Qos(depth=1, transient_local=True)
 SHORT_S = 1.5
+OF_ROS = """\
+<ros2_control name="all" type="system">
+  <hardware><plugin>mock_components/GenericSystem</plugin></hardware>
+  <joint name="j1"><command_interface name="position"/><state_interface name="position"/></joint>
+</ros2_control>
+<transmission name="t"><joint name="j1"/><actuator name="m1"/></transmission>
+<gazebo reference="j1_link"><material>Gazebo/Grey</material></gazebo>
+</robot>"""
+SILENT = ("writer", "rt/robot_description", "std_msgs::msg::dds_::String_")
+UNREACHED = (
+    "reader",
+    "rq/robot_state_publisher/get_parametersRequest",
+    "rcl_interfaces::srv::dds_::GetParameters_Request_",
+)
 
 
 class Peer:
@@ -166,6 +181,36 @@ def test_what_is_missing_is_named_with_what_is_there(settings: SessionProfile, p
         looked_at(settings, number=9, timeout_s=SHORT_S)
 
 
+@pytest.mark.parametrize(
+    ("end", "why"),
+    [
+        (
+            SILENT,
+            r"publishes /robot_description, and nothing .* through the bridge .*bridge-config",
+        ),
+        (UNREACHED, r"cannot be read: Fast DDS answers no call through the bridge"),
+    ],
+    ids=["a topic that the bridge does not let through", "a parameter on Fast DDS"],
+)
+def test_what_a_bridge_sees_and_does_not_carry_is_named(
+    settings: SessionProfile, end: tuple[str, str, str], why: str
+) -> None:
+    side, topic, kind = end
+    said = {"@/b/ros2/config": {"domain": 0}}
+    said[f"@/b/ros2/dds/010f00/{side}/1/{topic}"] = {"type_name": kind}
+
+    def tell(query: zenoh.Query) -> None:
+        with query:
+            for key, value in said.items():
+                if query.key_expr.intersects(zenoh.KeyExpr(key)):
+                    query.reply(key, json.dumps(value))
+
+    with open_session(settings, mode="router"), open_session(settings) as bridge:
+        bridge.declare_queryable("@/b/ros2/**", zenoh.handlers.Callback(tell, indirect=False))
+        with pytest.raises(ResourceError, match=why):
+            looked_at(settings, timeout_s=SHORT_S)
+
+
 def test_without_a_router_it_is_said_what_to_start(settings: SessionProfile) -> None:
     with pytest.raises(SessionError, match=r"start zenoh-bridge-ros2dds .* --connect tcp/ROBOT"):
         looked_at(settings)
@@ -181,7 +226,8 @@ def new(settings: SessionProfile, *words: str) -> tuple[int, str]:
 def robot(peer: Peer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Peer:
     """A peer that is an arm, and this test in a folder of its own."""
     monkeypatch.chdir(tmp_path)
-    peer.describe("/robot_description", urdf([*arm(SIX), TOOL]))
+    text = urdf([*arm(SIX), TOOL]).replace("</robot>", OF_ROS)
+    peer.describe("/robot_description", text)
     peer.states("/joint_states")
     return peer
 
