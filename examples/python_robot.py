@@ -12,7 +12,7 @@ from vla_zenoh.robot import Command, Reading
 
 
 class PerfectArm:
-    """Six joints. Options of the profile arrive as keyword arguments, as text."""
+    """Seven joints, no gripper. Options of the profile arrive as keyword arguments, as text."""
 
     def __init__(self, address: str) -> None:
         print("connecting to", address)  # connect here

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_rig import until
+from camera_rig import free_endpoint, until
 from chain import MOVING_M_S, READY_PATIENCE_S, Recorder, write_profile
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.client.client import Client
+from vla_zenoh.client.client import Client, StopOutcome
 from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.process import PARENT_VARIABLE
@@ -27,6 +27,7 @@ from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER, NodeCommand, Supervisor,
 
 pytestmark = pytest.mark.long
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 END_S = 3.0
 BUSY_S = 1.0
 """What a busy machine may add to it."""
@@ -140,6 +141,35 @@ def ends(running: Up, but: frozenset[int] = frozenset()) -> None:
             left = "\n".join(running.children().values()).replace("\0", " ")
             raise AssertionError(f"still there:\n{left}\n{running.text}")
         time.sleep(0.02)
+
+
+def test_a_stop_outlives_up_until_it_is_reset_and_the_example_of_a_robot_moves(
+    tmp_path: Path,
+) -> None:
+    path, endpoint = tmp_path / "lab.yaml", free_endpoint()
+    of_the_arm = {"state": "arm#", "command": "command#"}
+    path.write_text(
+        f"extends: {EXAMPLES / 'python_robot.yaml'}\n"
+        f"session: {{connect: [{endpoint}], listen: [{endpoint}]}}\n"
+    )
+    with up(str(path)) as first, client_of(path) as (client, recorder):
+        recorder.only = of_the_arm
+        get_moving(client, recorder)
+        client.stop()
+        until("it stands", lambda: client.stop_progress().outcome is StopOutcome.CONFIRMED)
+        first.end(signal.SIGTERM)
+    with up(str(path)), client_of(path) as (client, recorder):
+        until("it is stopped", lambda: state_of(client) == "stopped", READY_PATIENCE_S)
+        with pytest.raises(SessionError, match="stopped before this node was started"):
+            client.activate()
+        client.reset()
+        recorder.only = of_the_arm
+        get_moving(client, recorder)
+
+
+def state_of(client: Client) -> str:
+    status = client.status("command")
+    return status.state if status is not None else ""
 
 
 @pytest.mark.parametrize(

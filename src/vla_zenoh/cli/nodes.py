@@ -68,12 +68,11 @@ def router(
 
 
 def latch_file(profile: Profile, node: str) -> Path:
-    """File that exists while a stop is latched in a node, kept by `up`, or beside its log."""
-    if folder := os.environ.get(RUN_FOLDER_VARIABLE):
-        return Path(folder) / f"stopped-{node}"
+    """File that exists while a stop is latched in a node, beside the log of `up`."""
     from vla_zenoh.cli.up import default_log_folder
 
-    return default_log_folder() / f"stopped-{profile.robot.name}-{node}"
+    folder = os.environ.get(RUN_FOLDER_VARIABLE) or default_log_folder()
+    return Path(folder) / f"stopped-{profile.robot.name}-{node}"
 
 
 def run_robot(

@@ -120,7 +120,12 @@ def up(
     others = [effective_profile(name, host=host) for name in also or ()]
     missing = plugins.lacking(f"node.{ROLLING}")
     record = None if no_record or missing else rolling_folder(logs, loaded)
-    given: dict[str, Any] = {"also": others, "dry_run": dry_run, "rolling": record}
+    given: dict[str, Any] = {
+        "also": others,
+        "dry_run": dry_run,
+        "rolling": record,
+        "state": logs.absolute(),
+    }
     with Host(loaded, host, log=log, tell=tell, **given) as running:
         where = ", ".join(running.profile.session.connect)
         more = "; the robot gets no commands" if dry_run else ""

@@ -164,6 +164,7 @@ class Host:
         also: other robots' profiles that the router of this host serves.
         dry_run: the command node computes and checks everything but commands nothing.
         rolling: folder of the rolling record, which runs beside a command node; None: no record.
+        state: folder in which stops outlive this; None: they end with it.
 
     Raises:
         NodeError: this host already runs, or a router already answers although `own_router` is set
@@ -184,6 +185,7 @@ class Host:
         also: Sequence[Profile] = (),
         dry_run: bool = False,
         rolling: Path | None = None,
+        state: Path | None = None,
     ) -> None:
         self.host, part = choose_host(profile, host)
         changes: dict[str, Any] = {"connect": list(part.connect)} if part.connect else {}
@@ -211,7 +213,7 @@ class Host:
             commands,
             log=log,
             tell=tell,
-            variables={HOST_VARIABLE: self.host, RUN_FOLDER_VARIABLE: self._folder},
+            variables={HOST_VARIABLE: self.host, RUN_FOLDER_VARIABLE: str(state or self._folder)},
         )
         self._own_router = own_router
         self._down: DownNodes | None = None

@@ -39,8 +39,8 @@ def test_robots_of_one_host_do_not_share_a_stop(
     assert latch_file(profile, "sim") != latch_file(renamed, "sim")
 
 
-def test_under_up_the_stop_is_kept_in_its_folder(
+def test_up_says_in_which_folder_the_stop_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(RUN_FOLDER_VARIABLE, str(tmp_path))
-    assert latch_file(load_profile("panda_sim"), "sim") == tmp_path / "stopped-sim"
+    assert latch_file(load_profile("panda_sim"), "sim") == tmp_path / "stopped-panda-sim"
