@@ -13,6 +13,8 @@ from vla_zenoh_ros2.proposal import (
     Topic,
     arm_commands,
     camera_topics,
+    command_guess,
+    controller_states,
     gripper_commands,
     proposal,
 )
@@ -101,6 +103,26 @@ def test_a_trajectory_comes_before_plain_numbers_and_a_gripper_is_no_arm() -> No
     assert [each.name for each in gripper_commands(domain, "")] == [
         "/gripper_controller/joint_trajectory"
     ]
+
+
+def test_an_active_controller_of_the_arms_joints_comes_first_and_is_no_guess() -> None:
+    domain = RosDomain("ros2dds", 0)
+    names = ("/arm_a", "/arm_bb", "/arm_ccc", "/arm_dddd")
+    domain.subscribed |= {f"{name}/joint_trajectory": TRAJECTORY for name in names}
+    domain.published |= {
+        f"{name}/controller_state": "control_msgs/msg/JointTrajectoryControllerState"
+        for name in names[:3]
+    }
+    states = controller_states(domain, "")
+    assert [*states.values()] == [f"{name}/controller_state" for name in names[:3]]
+    controllers = dict(zip(states, [(), ("other",), ("j2", "j1")], strict=True))
+    found = arm_commands(domain, "", ARM.joints, controllers)
+    assert [each.name.split("/")[1] for each in found] == ["arm_ccc", "arm_dddd", "arm_a", "arm_bb"]
+    said = [command_guess(each, (), ARM, controllers.get(each.name))[1] for each in found]
+    assert said[0] == ""
+    assert "is not known" in said[1]
+    assert "is not active" in said[2]
+    assert "its controller moves other" in said[3]
 
 
 def test_a_namespace_leaves_out_another_robot() -> None:

@@ -17,6 +17,7 @@ from camera_rig import free_endpoint
 from described_arms import SIX, TOOL, arm, urdf
 from typer.testing import CliRunner
 from vla_zenoh_ros2.keys import Endpoint, EntityRole, Qos, RmwZenoh
+from vla_zenoh_ros2.proposal import CONTROLLER_STATE
 from vla_zenoh_ros2.survey import DEFINITIONS, GET_PARAMETERS, Survey, survey
 
 from vla_zenoh import plugins
@@ -105,6 +106,17 @@ class Peer:
             position=np.array(POSITION),
         )
         self._declared.append(Repeated(self._session, key, self.messages.encode(made)))
+
+    def control(self, controller: str, *, active: bool) -> None:
+        """A joint_trajectory_controller of all joints, whose state is longer than we read."""
+        self.listen(f"{controller}/joint_trajectory", "trajectory_msgs/msg/JointTrajectory")
+        key = self._announce(
+            EntityRole.PUBLISHER, f"{controller}/controller_state", CONTROLLER_STATE
+        )
+        made = self.messages.new(CONTROLLER_STATE, joint_names=list(JOINTS))
+        if active:
+            payload = self.messages.encode(made) + bytes(80)
+            self._declared.append(Repeated(self._session, key, payload))
 
     def close(self) -> None:
         for each in reversed(self._declared):
@@ -196,7 +208,7 @@ def test_what_a_bridge_sees_and_does_not_carry_is_named(
     settings: SessionProfile, end: tuple[str, str, str], why: str
 ) -> None:
     side, topic, kind = end
-    said = {"@/b/ros2/config": {"domain": 0}}
+    said: dict[str, dict[str, Any]] = {"@/b/ros2/config": {"domain": 0}}
     said[f"@/b/ros2/dds/010f00/{side}/1/{topic}"] = {"type_name": kind}
 
     def tell(query: zenoh.Query) -> None:
@@ -248,6 +260,21 @@ def test_an_option_chooses_the_topic_that_commands_the_arm(
     assert (made.ros2.bridge, made.ros2.domain) == ("rmw_zenoh", 4)
     assert "ros2.joint_command" not in made.unconfirmed
     assert "--home=0.100,-0.200,0.300,0.000,0.500,0.000" in said
+
+
+def test_the_controller_that_is_active_is_taken_and_nothing_is_unconfirmed_about_it(
+    settings: SessionProfile, robot: Peer
+) -> None:
+    robot.control("/arm_controller", active=False)
+    robot.control("/scaled_arm_controller", active=True)
+    robot.listen("/forward_position_controller/commands", NUMBERS)
+    code, said = new(settings, "--ros2")
+    assert code == 0, said
+    made = load_profile("made.yaml")
+    assert made.ros2 is not None
+    assert made.ros2.joint_command is not None
+    assert made.ros2.joint_command.topic == "/scaled_arm_controller/joint_trajectory"
+    assert "ros2.joint_command" not in made.unconfirmed
 
 
 def test_a_robot_without_controllers_is_simulated_by_a_description_beside_it(

@@ -143,15 +143,17 @@ def driven(
 
     joints, hand = arm.structure.arm, arm.gripper
     described = DescribedArm(joints, hand.joints, hand.values)
-    topics = arm_commands(found.domain, found.namespace)
+    topics = arm_commands(found.domain, found.namespace, joints, found.controllers)
     if not topics:
         return Drive(), [
             "no topic was found that commands the arm (a JointTrajectory, a Float64MultiArray, a "
             "pose): the profile is one of the simulator. Start the robot's controllers, and do "
             "this again"
         ]
-    place, what = command_guess(topics[0], topics[1:], described)
-    command = _command(found, answers.text("command", topics[0].name, place, what))
+    first, *others = topics
+    place, what = command_guess(first, others, described, found.controllers.get(first.name))
+    given = answers.option("command") or first.name
+    command = _command(found, answers.text("command", first.name, place, what) if what else given)
     made = proposal(found.domain, found.namespace, described, command, found.joints, found.images)
     answers.guesses += [Guess(place, what) for place, what in made.guesses]
     section = dict(made.section)
@@ -159,7 +161,9 @@ def driven(
         section = {"bridge": section.pop("bridge"), "connect": [*connect], **section}
     drive = Drive("ros2", made.command, section, made.cameras)
     shown = [f"camera {name}: {_shown(row)}" for name, row in made.cameras.items()]
-    return drive, [f"commands: {command.name} ({command.type})", *made.notes, *shown]
+    known = command == first and not what
+    active = ", whose controller is active and has the joints of the arm" if known else ""
+    return drive, [f"commands: {command.name} ({command.type}{active})", *made.notes, *shown]
 
 
 def home_of(found: Survey, joints: Sequence[str]) -> str:

@@ -27,6 +27,8 @@ GOAL = "multi_mode_control_msgs/msg/CartesianImpedanceGoal"
 ARM_COMMANDS = (TRAJECTORY, NUMBERS, GOAL, POSE_STAMPED)
 """Types that command an arm, the clearest first: a trajectory names its joints."""
 GRIPPER_TOPICS = (GRIPPER_MESSAGE, TRAJECTORY, NUMBER, NUMBERS)
+CONTROLLER_STATE = "control_msgs/msg/JointTrajectoryControllerState"
+"""What a joint_trajectory_controller publishes beside its topic of trajectories while active."""
 GRIPPER = re.compile(r"gripper|finger|hand|jaw|claw|grip|pinch", re.IGNORECASE)
 NO_ARM = re.compile(r"initial_?pose|goal_pose|clicked|velocity|effort|torque|(^|_)vel(_|$)", re.I)
 """Of topics whose type is one of `ARM_COMMANDS` and that do not take positions of an arm."""
@@ -116,12 +118,42 @@ def state_topics(domain: RosDomain, namespace: str) -> list[str]:
     return sorted(names, key=lambda name: (not name.endswith("/joint_states"), len(name), name))
 
 
-def arm_commands(domain: RosDomain, namespace: str) -> list[Topic]:
-    """Topics that may command the arm, the likeliest first."""
+def controller_states(domain: RosDomain, namespace: str) -> dict[str, str]:
+    """Topic of trajectories -> that of the state of its controller."""
+    states = {
+        each.name: f"{each.name.rpartition('/')[0]}/controller_state"
+        for each in arm_commands(domain, namespace)
+        if each.type == TRAJECTORY
+    }
+    return {
+        name: state
+        for name, state in states.items()
+        if domain.published.get(state) == CONTROLLER_STATE
+    }
+
+
+def arm_commands(
+    domain: RosDomain,
+    namespace: str,
+    joints: Sequence[str] = (),
+    controllers: Mapping[str, Sequence[str]] = {},
+) -> list[Topic]:
+    """Topics that may command the arm, the likeliest first.
+
+    Args:
+        joints: of the arm.
+        controllers: topic -> joints that its controller says it moves; none: it says nothing.
+    """
     found = below(namespace, domain.subscribed, ARM_COMMANDS)
     found = [each for each in found if not NO_ARM.search(each.name)]
     found = [each for each in found if not GRIPPER.search(each.name)]
-    return sorted(found, key=lambda each: (ARM_COMMANDS.index(each.type), len(each.name)))
+
+    def rank(topic: Topic) -> tuple[int, int, int]:
+        moved = controllers.get(topic.name)
+        likely = 1 if moved is None else 0 if {*moved} == {*joints} else 2
+        return likely, ARM_COMMANDS.index(topic.type), len(topic.name)
+
+    return sorted(found, key=rank)
 
 
 def gripper_commands(domain: RosDomain, namespace: str) -> list[Topic]:
@@ -285,10 +317,23 @@ def _camera(
     return row | {"width": heard.width, "height": heard.height}
 
 
-def command_guess(command: Topic, others: Sequence[Topic], arm: DescribedArm) -> tuple[str, str]:
-    """Place in the profile of the topic that moves the arm, and what is not known of it."""
+def command_guess(
+    command: Topic, others: Sequence[Topic], arm: DescribedArm, moved: Sequence[str] | None
+) -> tuple[str, str]:
+    """Place in the profile of the topic that moves the arm, and what is not known of it.
+
+    That is nothing, an empty text, where its controller is active and has the joints of the arm.
+
+    Args:
+        moved: joints that its controller says it moves, see `arm_commands`.
+    """
     kind = "joint" if command.type in (TRAJECTORY, NUMBERS) else "pose"
+    if moved is not None and {*moved} == {*arm.joints}:
+        return f"ros2.{kind}_command", ""
     what = f"{command.type}; whether its controller is active, and moves this arm, is not known"
+    if moved is not None:
+        said = f"moves {', '.join(moved)}" if moved else "is not active: it publishes no state"
+        what = f"{command.type}; its controller {said}"
     if command.type == NUMBERS:
         what += f"; its numbers are taken for those of {', '.join(arm.joints)}, in this order"
     what += f"; there is also: {_named(others)}" if others else ""

@@ -19,13 +19,23 @@ from vla_zenoh.profile import SessionProfile
 from vla_zenoh.profile.robot import Ros2Profile
 from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
 from vla_zenoh_ros2.bridge_view import CONFIGS, MAX_REPLY_BYTES
-from vla_zenoh_ros2.keys import LATCHED, SENSOR, TEXT, TOKENS_OF_RMW
+from vla_zenoh_ros2.keys import (
+    LATCHED,
+    SENSOR,
+    TEXT,
+    TOKENS_OF_RMW,
+    Endpoint,
+    EntityRole,
+    RmwZenoh,
+)
 from vla_zenoh_ros2.proposal import (
+    CONTROLLER_STATE,
     HeardImages,
     HeardJoints,
     Topic,
     below,
     camera_topics,
+    controller_states,
     state_topics,
 )
 from vla_zenoh_ros2.readers import JOINT_STATE, read
@@ -37,12 +47,15 @@ PARAMETER = "robot_description"
 GET_PARAMETERS = "rcl_interfaces/srv/GetParameters"
 DEFINITIONS = {
     GET_PARAMETERS: "string[] names\n---\nrcl_interfaces/ParameterValue[] values\n",
+    CONTROLLER_STATE: "std_msgs/Header header\nstring[] joint_names\n",
 }
+"""Of the state of a controller only how it begins, which is the same in every distribution."""
 ASK_S, POLL_S = 1.0, 0.3
 SETTLED_S = 1.0
 """Names that did not change for so long are all there are."""
 LISTEN_S = 1.0
 """Joint states and images are listened to for so long after the first joint state."""
+CONTROLLERS_S = 2.0
 STATES = 4096
 SHOWN = 12
 """Names in a message, at most."""
@@ -60,6 +73,8 @@ class Survey(NamedTuple):
         described_by: the topic or parameter that has it.
         joints: what was heard of joint states, by topic.
         images: what was heard of cameras, by topic.
+        controllers: topic of trajectories -> joints that its controller says it moves; none: it
+            publishes no state, as one that is not active.
     """
 
     domain: RosDomain
@@ -68,6 +83,7 @@ class Survey(NamedTuple):
     described_by: str
     joints: Mapping[str, HeardJoints]
     images: Mapping[str, HeardImages]
+    controllers: Mapping[str, tuple[str, ...]]
 
 
 def survey(
@@ -130,9 +146,10 @@ class _Look:
                 topics, parameters = _descriptions(domain, namespace)
                 space, text, by = self._description(domain, topics, parameters)
             joints, images = self._states(domain, space)
+            controllers = self._controllers(domain, space)
         finally:
             self._graph.close()
-        return Survey(domain, space, text, by, joints, images)
+        return Survey(domain, space, text, by, joints, images, controllers)
 
     # -- names ------------------------------------------------------------------------------------
     def _domain(self, namespace: str | None, number: int | None, *, describe: bool) -> RosDomain:
@@ -319,6 +336,33 @@ class _Look:
                 if (image := self._image(topic, ring, rate_hz)) is not None
             },
         )
+
+    def _controllers(self, domain: RosDomain, namespace: str) -> dict[str, tuple[str, ...]]:
+        """Of each controller of trajectories, the joints that its state names."""
+        # With rmw_zenoh the hash is part of the key, and that of the whole message is not known.
+        wire = RmwZenoh("", "", domain.number, lambda kind: "*")
+        rings: dict[str, CallbackRing] = {}
+        for command, state in controller_states(domain, namespace).items():
+            ring = rings[command] = CallbackRing(1)
+            if domain.bridge == "rmw_zenoh":
+                end = Endpoint(EntityRole.SUBSCRIBER, state, CONTROLLER_STATE)
+                ring.subscribe(self._session, wire.key(end))
+            else:
+                self._graph.subscribe(state, CONTROLLER_STATE, ring, SENSOR)
+        if rings:
+            self._tell(f"listening to {len(rings)} controller(s)")
+            _until(lambda: all(ring.has_new for ring in rings.values()) or None, CONTROLLERS_S)
+        return {command: self._moved(ring) for command, ring in rings.items()}
+
+    def _moved(self, ring: CallbackRing) -> tuple[str, ...]:
+        arrival = ring.pop()
+        if arrival is None:
+            return ()
+        try:
+            payload = bytes_of(arrival.sample.payload)
+            return tuple(self._messages.decode(CONTROLLER_STATE, payload).joint_names)
+        except CodecError:
+            return ()
 
     def _joints(self, ring: CallbackRing, rate_hz: float) -> HeardJoints:
         position: dict[str, float] = {}
