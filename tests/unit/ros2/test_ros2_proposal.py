@@ -194,6 +194,8 @@ def test_joints_are_read_where_they_are_published_and_missing_ones_are_unconfirm
     assert {*guesses} == {"ros2.joint_states", "ros2.use_sim_time"}
     assert "nothing was heard of j2, but of other" in guesses["ros2.joint_states"]
     assert "timing.state_timeout_s to 0.30" in " ".join(made.notes)
+    whole = proposal(domain, "", ARM, JOINTS_TO, HEARD, {})
+    assert "/joint_states, 100 Hz: j1 0.100, j2 -0.200, finger 0.000" in whole.notes
 
 
 def test_a_camera_has_the_size_of_its_images_or_is_unconfirmed() -> None:

@@ -23,7 +23,7 @@ from vla_zenoh_ros2.survey import DEFINITIONS, GET_PARAMETERS, Survey, survey
 from vla_zenoh import plugins
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import PluginError, ResourceError, SessionError
-from vla_zenoh.profile import SessionProfile, load_profile
+from vla_zenoh.profile import SessionProfile, load_profile, simulated
 from vla_zenoh.program.main import app
 from vla_zenoh.ros2.messages import Messages
 
@@ -259,6 +259,7 @@ def test_an_option_chooses_the_topic_that_commands_the_arm(
     assert made.ros2.joint_command.topic == "/second/commands"
     assert (made.ros2.bridge, made.ros2.domain) == ("rmw_zenoh", 4)
     assert "ros2.joint_command" not in made.unconfirmed
+    assert simulated(made).robot.driver == "sim"
     assert "--home=0.100,-0.200,0.300,0.000,0.500,0.000" in said
 
 

@@ -236,11 +236,8 @@ def _states(
         why += f", but of {', '.join(others)}" if others else ""
         guesses.append(("ros2.joint_states", why))
     else:
-        where = ", ".join(f"{heard.position[name]:.3f}" for name in arm.joints)
-        notes.append(
-            f"{topic}: {len(heard.position)} joints at {heard.rate_hz:.0f} Hz; the arm stands at "
-            f"{where}"
-        )
+        where = ", ".join(f"{name} {at:.3f}" for name, at in heard.position.items())
+        notes.append(f"{topic}, {heard.rate_hz:.0f} Hz: {where}")
     if 0.0 < heard.rate_hz < SLOW_HZ:
         patience_s = LATE_STATES / heard.rate_hz
         notes.append(

@@ -261,7 +261,7 @@ class _Look:
                 f"a node publishes {topic}, and nothing of it comes through the bridge within "
                 f"{self._timeout_s:g} s. Does the bridge's file allow it? That of `profile "
                 "bridge-config` does not: start it without one, zenoh-bridge-ros2dds -d "
-                f"{domain.number}"
+                f"{domain.number}. Nodes of Kilted need a setting: docs/how-to/ros2.md"
             )
         return f"a node publishes {topic}, and nothing came within {self._timeout_s:g} s"
 
