@@ -341,6 +341,23 @@ def test_absolute_poses_are_held_against_the_workspace(
     assert found_in(action, row) == wanted
 
 
+@pytest.mark.parametrize("controller", [None, {"kp": 150.0, "damping_ratio": 1.0}])
+@pytest.mark.parametrize("rotation", ["rpy", "rotvec", "quaternion", "rotation_6d"])
+@pytest.mark.parametrize("kind", ["delta", "absolute"])
+@pytest.mark.parametrize("number", [0.0, 2.0, -3e38])
+def test_numbers_that_may_be_no_rotation_are_findings(
+    kind: str, rotation: str, number: float, controller: dict[str, float] | None
+) -> None:
+    fields = {"kind": kind, "rotation": rotation, "controller": controller, "gripper": "none"}
+    if kind == "absolute":
+        del fields["controller"]
+    action = ActionSpec.model_validate({"horizon": 1, "dt_s": 0.1, **fields})
+    turns = [number] * (action.dimension - 3)
+    found = found_in(action, [0.43, 0.0, 0.2, *turns])
+    if rotation in ("quaternion", "rotation_6d"):
+        assert ("error", rotation) in found
+
+
 @pytest.mark.parametrize(
     ("row", "wanted"),
     [

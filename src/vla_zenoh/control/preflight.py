@@ -169,6 +169,8 @@ def reasons_by_joints(
         joints_rad = kinematics.joints_of(joint.record)
         action = spec.action.of(profile.part)
         steps = check_steps(spec.action, chunk.steps)[:, spec.action.columns(profile.part)]
+        here, jacobian = kinematics.pose_and_jacobian(joints_rad)
+        axes = policy_check.beyond_joints(action, steps, jacobian, here.rotation)
     except (RecordError, SpecError):
         return []  # there is a reason for it already
     found = policy_check.joints_as_pose(action, steps, joints_rad, profile.limits)
@@ -176,8 +178,6 @@ def reasons_by_joints(
         given = bounds.in_chain_order(action, steps.astype(np.float64))
         far = bounds.far_out_of_range(action, given, joints_rad)
         found += [] if far is None else [policy_check.error("joint_limit", far.why)]
-    here, jacobian = kinematics.pose_and_jacobian(joints_rad)
-    axes = policy_check.beyond_joints(action, steps, jacobian, here.rotation)
     reasons = [
         f"worker {worker!r}: its newest chunk is not sane: {name}: {why}" for _, name, why in found
     ]

@@ -139,6 +139,8 @@ def check_chunk(
         steps: (H, D), as `vla_zenoh.policy.check_steps` gives them.
     """
     found = list(chunk_errors(spec, steps, limits, max_width_m))
+    if {"quaternion", "rotation_6d"} & {each.name for each in found}:
+        return found  # there is no pose to look at
     if spec.space == "joint":
         found += _joint_steps(spec, steps, limits)
     elif spec.kind == "absolute":
