@@ -166,24 +166,24 @@ COMMANDS = Group("vla_zenoh.commands", "command", FunctionType)
 this package cannot be replaced."""
 GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS, COMMANDS)
 _COMMANDS_OF: Mapping[str, str] = {
-    "vla-zenoh-benchmarks": "bench.command bench.sim bench.task compare",
+    "vla-zenoh-benchmarks": "bench.command bench.task bench.sim compare",
     "vla-zenoh-calibrate": "camera.board camera.calibrate",
-    "vla-zenoh-canary": "canary.back canary.promote canary.watch",
-    "vla-zenoh-conform": "conform.camera conform.robot conform.worker",
+    "vla-zenoh-canary": "canary.watch canary.promote canary.back",
+    "vla-zenoh-conform": "conform.robot conform.worker conform.camera",
     "vla-zenoh-dataset": "dataset.export dataset.stats",
     "vla-zenoh-diagnose": "inspect net",
-    "vla-zenoh-figures": "figure.latency figure.motion figure.success",
+    "vla-zenoh-figures": "figure.motion figure.latency figure.success",
     "vla-zenoh-mcp": "serve.mcp",
     "vla-zenoh-newarm": "profile.new",
     "vla-zenoh-nights": "nights",
     "vla-zenoh-otel": "otel",
-    "vla-zenoh-primitives": "do.grip do.home do.move-to do.run node.primitives",
+    "vla-zenoh-primitives": "do.move-to do.home do.grip do.run node.primitives",
     "vla-zenoh-r2c": "serve.r2c",
     "vla-zenoh-replay": "replay",
     "vla-zenoh-rolling": "node.rolling save",
     "vla-zenoh-ros2": "node.ros2 profile.bridge-config",
-    "vla-zenoh-secure": "secure.add secure.here secure.init secure.rename secure.retire "
-    "secure.revoke secure.show",
+    "vla-zenoh-secure": "secure.init secure.add secure.here secure.show secure.revoke "
+    "secure.retire secure.rename",
     "vla-zenoh-serve": "serve.policy",
     "vla-zenoh-strands": "serve.strands",
     "vla-zenoh-teleop": "teleop",
@@ -194,7 +194,8 @@ _COMMANDS_OF: Mapping[str, str] = {
 PACKAGES: Mapping[str, str] = {
     command: package for package, own in _COMMANDS_OF.items() for command in own.split()
 }
-"""Command of a package in ``plugins/`` -> that package, for a computer that lacks it."""
+"""Command of a package in ``plugins/`` -> that package, for a computer that lacks it; help has this
+order."""
 NEEDED: Mapping[str, tuple[str, ...]] = {
     "lerobot_robot_vla_zenoh": ("vla-zenoh-policy-servers",),
     "vla-zenoh-canary": ("vla-zenoh-benchmarks",),

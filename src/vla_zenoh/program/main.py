@@ -39,10 +39,10 @@ OTHERS = "Of other packages"
 
 
 class CommandGroup(NamedTuple):
-    """Several commands under one word: name -> ``module:function`` inside the package."""
+    """Several commands under one word: name -> ``module:function``; packages bring more."""
 
     help: str
-    commands: Mapping[str, str | None]
+    commands: Mapping[str, str] = {}
 
 
 Panels = Mapping[str, Mapping[str, str | CommandGroup | None]]
@@ -58,12 +58,9 @@ COMMANDS: Panels = {
             {
                 "router": "cli.nodes:router",
                 "sim": "cli.nodes:sim",
-                "ros2": OF_A_PACKAGE,
                 "arm": "cli.nodes:arm",
                 "camera": "cli.nodes:camera",
                 "command": "cli.nodes:command",
-                "primitives": OF_A_PACKAGE,
-                "rolling": OF_A_PACKAGE,
             },
         ),
     },
@@ -77,18 +74,13 @@ COMMANDS: Panels = {
         "stop": "cli.drive:stop",
         "reset": "cli.drive:reset",
         "do": CommandGroup(
-            "Guarded motions: go to a pose, home, grip, run a model until a condition holds.",
-            dict.fromkeys(("move-to", "home", "grip", "run"), OF_A_PACKAGE),
+            "Guarded motions: go to a pose, home, grip, run a model until a condition holds."
         ),
         "canary": CommandGroup(
-            "Try a new model in shadow on several robots; promote it or take it back.",
-            dict.fromkeys(("watch", "promote", "back"), OF_A_PACKAGE),
+            "Try a new model in shadow on several robots; promote it or take it back."
         ),
         "web": OF_A_PACKAGE,
-        "serve": CommandGroup(
-            "Offer a model to clients of other frameworks.",
-            dict.fromkeys(("policy", "mcp", "r2c", "strands"), OF_A_PACKAGE),
-        ),
+        "serve": CommandGroup("Offer a model to clients of other frameworks."),
     },
     "Watch and record": {
         "status": "cli.status:status",
@@ -104,18 +96,15 @@ COMMANDS: Panels = {
     "Check and measure": {
         "check": "lab.cli.check:check",
         "conform": CommandGroup(
-            "Judge a robot, worker or camera of others by the rules of the wire.",
-            dict.fromkeys(("robot", "worker", "camera"), OF_A_PACKAGE),
+            "Judge a robot, worker or camera of others by the rules of the wire."
         ),
         "doctor": "lab.cli.doctor:doctor",
         "profile": CommandGroup(
             "List, show, check and make profiles.",
             {
-                "bridge-config": OF_A_PACKAGE,
                 "list": "lab.cli.profile:list_profiles",
                 "show": "lab.cli.profile:show",
                 "check": "lab.cli.profile:check",
-                "new": OF_A_PACKAGE,
             },
         ),
         "robot": CommandGroup(
@@ -123,30 +112,17 @@ COMMANDS: Panels = {
         ),
         "camera": CommandGroup(
             "List the cameras of this computer, and calibrate them.",
-            {
-                "list": "lab.cli.camera:camera_list",
-                **dict.fromkeys(("board", "calibrate"), OF_A_PACKAGE),
-            },
+            {"list": "lab.cli.camera:camera_list"},
         ),
         "secure": CommandGroup(
             "Certificates for a lab, so that only its hosts connect, with the rights of their "
-            "roles.",
-            dict.fromkeys(
-                ("init", "add", "here", "show", "revoke", "retire", "rename"), OF_A_PACKAGE
-            ),
+            "roles."
         ),
-        "dataset": CommandGroup(
-            "Turn recorded runs into training data.",
-            dict.fromkeys(("export", "stats"), OF_A_PACKAGE),
-        ),
-        "bench": CommandGroup(
-            "Measure this computer, and how well models do tasks.",
-            dict.fromkeys(("command", "task", "sim"), OF_A_PACKAGE),
-        ),
+        "dataset": CommandGroup("Turn recorded runs into training data."),
+        "bench": CommandGroup("Measure this computer, and how well models do tasks."),
         "compare": OF_A_PACKAGE,
         "figure": CommandGroup(
-            "Figures for a paper: PDF, SVG or PNG at the width of a column or a page.",
-            dict.fromkeys(("motion", "latency", "success"), OF_A_PACKAGE),
+            "Figures for a paper: PDF, SVG or PNG at the width of a column or a page."
         ),
         "inspect": OF_A_PACKAGE,
         "net": OF_A_PACKAGE,
@@ -219,10 +195,10 @@ class _LazyCommands(Mapping[str, Any]):
 
     @cached_property
     def others(self) -> dict[str, CommandGroup | None]:
-        """Those that packages bring and the table does not name."""
+        """Those that packages bring, ours first, and the table does not name."""
         depth = len(self._path)
         found: dict[str, CommandGroup | None] = {}
-        for entry in plugins.installed(plugins.COMMANDS):
+        for entry in (*plugins.PACKAGES, *plugins.installed(plugins.COMMANDS)):
             words = entry.split(".")
             if words[:depth] != [*self._path] or len(words) == depth:
                 continue
@@ -274,7 +250,9 @@ def _lazy_group(panels: Panels, path: Sequence[str] = ()) -> type[TyperGroup]:
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             commands: Any = self.commands
             width = max(map(len, commands))
-            for title, names in {**panels, OTHERS: commands.others}.items():
+            # In a group nobody asks who brings what.
+            sections = {"Commands": commands} if path else {**panels, OTHERS: commands.others}
+            for title, names in sections.items():
                 shown = [name for name in names if not commands[name].hidden]
                 if not shown:
                     continue

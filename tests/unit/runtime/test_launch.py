@@ -58,7 +58,8 @@ def test_every_kind_of_node_may_stand_in_a_profile_and_every_robot_driver_is_one
 def test_every_kind_of_node_has_a_command() -> None:
     nodes = COMMANDS["Run"]["node"]
     assert isinstance(nodes, CommandGroup)
-    assert {*nodes.commands, "worker"} == {*NODE_KINDS, ROLLING}
+    of_packages = {name.partition("node.")[2] for name in plugins.PACKAGES} - {""}
+    assert {*nodes.commands, *of_packages, "worker"} == {*NODE_KINDS, ROLLING}
     assert "worker" in COMMANDS["Run"]
 
 
