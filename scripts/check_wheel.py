@@ -28,18 +28,7 @@ LEFT_OUT = re.compile(r"training/|\.safetensors|benchmarks/|tests/|openvla/measu
 TRIALS = [
     ["--help"],
     ["profile", "list"],
-    [
-        "demo",
-        "--prompt",
-        "HARD: go up",
-        "--rate",
-        "5",
-        "--steps",
-        "5",
-        "--output",
-        "runs",
-        "--force",
-    ],
+    ["demo", "--prompt", "HARD: go up x5", "--rate", "5", "--output", "runs", "--force"],
 ]
 
 

@@ -34,7 +34,7 @@ WRONG: list[tuple[str, int, str]] = [
     ("stpo", USAGE, "No such command 'stpo'."),
     ("demo --rate abc", USAGE, "Invalid value for '--rate': wants a number (given: 'abc')"),
     ("demo --rate -1", USAGE, "Invalid value for '--rate': must be at least 0.2 (given: '-1')"),
-    ("demo --steps 1.5", USAGE, "Invalid value for '--steps': wants a whole number (given: '1.5')"),
+    ("demo --seed 1.5", USAGE, "Invalid value for '--seed': wants a whole number (given: '1.5')"),
     (
         "demo --profile nosuch",
         FAILED,

@@ -11,7 +11,6 @@ from vla_zenoh.cli.options import DEFAULT_PROFILE, MAX_INDEX, not_empty, options
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.lab.cli.options import DemoOptions
 
-DEFAULT_STEPS = 50
 TASK_PROFILE = "panda_bricks"
 NEEDED = ("mujoco", "pinocchio", "ruckig", "mcap", "plotly", "av")
 EXTRAS = "brick,sim"
@@ -27,12 +26,9 @@ def demo(
             "--prompt",
             parser=not_empty,
             help="A task such as 'put the red brick in the box', or a fixed motion such as "
-            "'HARD: go up'. Default: one task of every kind.",
+            "'HARD: go up x20'. Default: one task of every kind.",
         ),
     ] = None,
-    steps: Annotated[
-        int, typer.Option("--steps", help="Steps of a fixed motion.", min=1, max=10_000)
-    ] = DEFAULT_STEPS,
     seed: Annotated[
         int | None, typer.Option("--seed", help="Of the layout of the tasks.", min=0, max=MAX_INDEX)
     ] = None,
@@ -48,7 +44,7 @@ def demo(
     if prompt is not None and prompt.strip().lower().startswith(("hard", "hold")):
         from vla_zenoh.lab.cli.demo_run import run_demo
 
-        run_demo(prompt, steps, given.profile or DEFAULT_PROFILE, given)
+        run_demo(prompt, given.profile or DEFAULT_PROFILE, given)
         return
     from vla_zenoh.lab.cli.demo_tasks import run_task_demo
     from vla_zenoh.lab.tasks.task import FIRST_SEED

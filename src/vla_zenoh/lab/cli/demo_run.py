@@ -21,6 +21,8 @@ from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.types import GripperState, PoseState
 
+STEPS = 50
+"""Where neither the prompt nor ``--seconds`` says how many."""
 SETTLE_S = 0.8
 """From the end of the commanded motion until arm and integral action are at rest."""
 SLACK_S = 15.0
@@ -28,17 +30,10 @@ EXACT_M, EXACT_RAD = 0.002, 0.005
 """A fixed motion that is off by more was not done: distance, angle, drift and a gripper's width."""
 
 
-def run_demo(prompt: str, steps: int, profile: str, given: DemoOptions) -> None:
-    """Run a fixed motion and show how far it came.
-
-    Args:
-        steps: where neither the prompt nor ``--seconds`` says how many.
-
-    Raises:
-        SpecError: the scripted model does not know the prompt.
-    """
+def run_demo(prompt: str, profile: str, given: DemoOptions) -> None:
+    """Run a fixed motion and show how far it came; `SpecError`: the prompt names none."""
     parsed = parse_scripted(prompt)
-    steps = parsed.steps or steps
+    steps = parsed.steps or STEPS
     if given.seconds is not None:
         steps = max(round(given.seconds * given.rate_hz), 1)
     asked = parsed._replace(steps=steps).text

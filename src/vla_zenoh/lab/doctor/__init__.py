@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Callable, Iterator
 
 from vla_zenoh.bus.shared_memory import lockable_bytes
@@ -18,7 +19,7 @@ from vla_zenoh.lab.doctor.computer import (
     wall_clock,
 )
 from vla_zenoh.lab.doctor.needs import HostFinding, Level, Needs, Role, needs_of
-from vla_zenoh.lab.doctor.software import libraries, opengl, python_version
+from vla_zenoh.lab.doctor.software import libraries, opengl
 
 __all__ = ["HostFinding", "Level", "Needs", "Role", "examine", "needs_of"]
 
@@ -31,7 +32,7 @@ def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[HostFindi
     Args:
         try_zenoh: opens a session at an endpoint and closes it; returns why that failed, or "".
     """
-    yield python_version()
+    yield HostFinding("Python", "ok", platform.python_version())  # pip refuses an older one
     results = {role: libraries(role, required=role in needs.roles) for role in ROLES}
     yield from results.values()
     if results["sim"].level == "ok":

@@ -89,11 +89,12 @@ def _text(path: Path) -> str:
 
 
 def _limit_advice(limit: str) -> str:
+    return f"{_limit_line(limit)}; in a container: --cap-add=SYS_NICE"
+
+
+def _limit_line(limit: str) -> str:
     user = os.environ.get("USER") or str(os.getuid())
-    return (
-        f"add the line '{user} - {limit}' to {LIMITS_FILE} and log in again; in a container: "
-        "--cap-add=SYS_NICE"
-    )
+    return f"add the line '{user} - {limit}' to {LIMITS_FILE} and log in again"
 
 
 MIB = 1024 * 1024
@@ -136,11 +137,10 @@ def locked_memory(may_lock: int | None) -> HostFinding:
             "programs copy images through sockets, twice as slow; another Zenoh program that keeps "
             "shared memory on loses them without an error"
         )
-    user = os.environ.get("USER") or str(os.getuid())
     advice = (
-        f"add the line '{user} - memlock unlimited' to {LIMITS_FILE} and log in again; in a "
-        "systemd unit: LimitMEMLOCK=infinity; in a container: --ulimit memlock=-1. In other Zenoh "
-        "programs: transport/shared_memory/enabled: false"
+        f"{_limit_line('memlock unlimited')}; in a systemd unit: LimitMEMLOCK=infinity; in a "
+        "container: --ulimit memlock=-1. In other Zenoh programs: "
+        "transport/shared_memory/enabled: false"
     )
     return judged("locked memory", enough, found, advice)
 

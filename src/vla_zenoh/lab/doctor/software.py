@@ -14,7 +14,6 @@ from vla_zenoh.lab.doctor.needs import HostFinding, Role, judged, nodes_on
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.backend import RAYCAST, VARIABLE, Backend, choose_backend
 
-OLDEST_PYTHON = (3, 11)
 LIMIT_S = 60
 
 MODULES: Mapping[Role, Mapping[str, str]] = {
@@ -67,11 +66,6 @@ for name in sys.argv[1:]:
         error = f"{type(caught).__name__}: {caught}"
     print(json.dumps([name, error]), flush=True)
 """
-
-
-def python_version(version: tuple[int, ...] = tuple(sys.version_info[:3])) -> HostFinding:
-    text, advice = ".".join(map(str, version)), "install Python 3.11 or newer"
-    return judged("Python", version >= OLDEST_PYTHON, text, advice, "fail")
 
 
 def load_errors(modules: list[str]) -> dict[str, str]:
