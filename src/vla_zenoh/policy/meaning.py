@@ -180,6 +180,7 @@ def _of_columns(numbers: Numbers) -> list[float]:
     """
     given = np.asarray(numbers, np.float64)
     first, second = given[:3], given[3:]
+    second = second / max(1.0, float(np.linalg.norm(second)))  # what is parallel leaves no noise
     long = float(np.linalg.norm(first))
     if long >= SHORTEST_COLUMN:
         first = first / long
