@@ -33,6 +33,7 @@ from vla_zenoh_ros2 import readers
 from vla_zenoh_ros2.bridge_view import read_view
 from vla_zenoh_ros2.keys import Attachment
 from vla_zenoh_ros2.pictures import COMPRESSED_IMAGE, IMAGE
+from vla_zenoh_ros2.ros_names import domains_of_bridges, domains_of_rmw
 from vla_zenoh_serve import openpi_server
 from vla_zenoh_strands import wire as strands
 
@@ -57,6 +58,7 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.ros2.messages import Messages, parse
 from vla_zenoh.types import ClockReply, Depth, Event, Header, InferenceDebug, NodeStatus
 
+ENTITY = "@/b1/ros2/dds/010f00/writer/1/rt/joint_states"
 OF_TORCH = Path(__file__).parents[1] / "contract" / "lerobot_actions.pickle"
 CORPUS = Path(__file__).parent / "corpus"
 """Inputs that once broke a reader, or nearly: a folder for each target."""
@@ -519,6 +521,18 @@ def _targets() -> Iterator[Target]:
         lambda data: read_view([("@/b1/ros2/config", data), (_text(data), b"{}")]),
         codec,
         lambda: [b'{"domain": 3}', b"@/b1/ros2/dds/010f00"],
+    )
+    yield Target(
+        "ros2-names-of-a-bridge",
+        lambda data: domains_of_bridges([("@/b1/ros2/config", b"{}"), (ENTITY, data)]),
+        codec,
+        lambda: [b'{"type_name": "a::msg::dds_::B_", "qos": {"user_data": [1, 2]}}'],
+    )
+    yield Target(
+        "ros2-names-of-rmw-zenoh",
+        lambda data: domains_of_rmw([_text(data)]),
+        codec,
+        lambda: [b"@ros2_lv/3/ab/0/1/MP/%/%/arm/%a/a::msg::dds_::B_/RIHS01_0/::,1:,:,:,,"],
     )
     yield Target(
         "ros2-definition",

@@ -212,14 +212,16 @@ class Announced(NamedTuple):
 
 TOKENS_OF_RMW = "@ros2_lv/**"
 """Key expression of all tokens of rmw_zenoh, in every domain."""
-_ANNOUNCED = 13
-"""Chunks of the token of an end."""
+_ANNOUNCED, DOMAIN_DIGITS = 13, 3
+"""Chunks of the token of an end; digits of its domain."""
 
 
 def read_token(token: str) -> Announced | None:
     """What a token of rmw_zenoh says; None: it is none of an end in a ROS graph."""
     chunks = token.split("/")
-    if len(chunks) != _ANNOUNCED or chunks[0] != "@ros2_lv" or not chunks[1].isdecimal():
+    if len(chunks) != _ANNOUNCED or chunks[0] != "@ros2_lv":
+        return None
+    if not (chunks[1].isdecimal() and len(chunks[1]) <= DOMAIN_DIGITS):
         return None
     kind = ros_type(chunks[10])
     if kind is None:

@@ -12,6 +12,7 @@ from vla_zenoh_ros2.keys import EntityRole, read_token, ros_type
 
 ENTITIES = "@/*/ros2/dds/*/*/*/**"
 """Key expression of the bridges' writers and readers in DDS."""
+DOMAINS = range(233)
 OURS = "vla_"
 """Names of our own nodes begin with it."""
 _GOAL, _GOAL_TYPE = "/_action/send_goal", "_SendGoal"
@@ -64,7 +65,8 @@ class RosDomain:
 def domains_of_bridges(replies: Replies) -> list[RosDomain]:
     """Domains that bridges serve, by their replies to `CONFIGS` and `ENTITIES`."""
     replies = list(replies)
-    numbers = {one: domain or 0 for one, domain in read_view(replies).domains.items()}
+    served = read_view(replies).domains.items()
+    numbers = {one: domain if domain and domain in DOMAINS else 0 for one, domain in served}
     found = {number: RosDomain("ros2dds", number) for number in numbers.values()}
     for key, payload in replies:
         # @/BRIDGE/ros2/dds/PARTICIPANT/SIDE/ID/TOPIC
@@ -92,7 +94,7 @@ def _user_data(said: dict[str, Any]) -> bytes:
     qos = said.get("qos")
     given = qos.get("user_data") if isinstance(qos, dict) else None
     try:
-        return bytes(given or ())
+        return bytes(given) if isinstance(given, list) else b""
     except (TypeError, ValueError):
         return b""
 
@@ -101,7 +103,7 @@ def domains_of_rmw(tokens: Iterable[str]) -> list[RosDomain]:
     """Domains of nodes with rmw_zenoh, by their liveliness tokens."""
     found: dict[int, RosDomain] = {}
     for end in filter(None, map(read_token, tokens)):
-        if end.node.startswith(OURS):
+        if end.node.startswith(OURS) or end.domain not in DOMAINS:
             continue
         domain = found.setdefault(end.domain, RosDomain("rmw_zenoh", end.domain))
         if end.role == EntityRole.PUBLISHER.value:
