@@ -117,6 +117,7 @@ OTHER_VALUES: dict[tuple[str, ...], list[Any]] = {
     ("action", "gripper_threshold"): [0.4],
     ("action", "normalisation"): ["bridge_orig"],
     ("action", "pace"): ["soonest"],
+    ("action", "turns"): ["counted"],
     ("action", "parts"): [
         [{"part": part, "action": {"horizon": 1, "dt_s": 0.2}} for part in names]
         for names in (["left"], ["left", "right"], ["right", "left"])

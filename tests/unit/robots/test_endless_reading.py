@@ -9,14 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from driver_report import Report
 from endless_arm import ENDLESS, HOME_RAD, endless_arm
 from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.joint_reading import JointReading
-from vla_zenoh.types import FloatArray, JointState
+from vla_zenoh.robots.python_driver import PythonDriver
+from vla_zenoh.types import FloatArray, JointReference, JointState
 from vla_zenoh.types.records import Joints
 
 TURN = 2 * math.pi
@@ -111,3 +115,41 @@ def test_a_frozen_state_is_still_rejected() -> None:
     reading.take(joints, STAMP_NS)
     with pytest.raises(CodecError, match="came again"):
         reading.take(joints, STAMP_NS)
+
+
+ARM = """
+from vla_zenoh.robot import Reading
+
+
+class Wraps:
+    def __init__(self):
+        self.at, self.moved = [], []
+
+    def read(self):
+        return Reading(self.at)
+
+    def move(self, command):
+        self.moved.append(command.position_rad)
+"""
+
+
+def test_a_robot_class_is_moved_in_its_own_numbers(tmp_path: Path) -> None:
+    (tmp_path / "wraps.py").write_text(ARM)
+    here = {
+        "arm": {"file": "wraps.py"},
+        "cameras": {"front": None, "wrist": None},
+        "hosts": {"here": {"nodes": ["router", "arm", "command", "worker"]}},
+        "robot": {**PROFILE.robot.model_dump(mode="json"), "driver": "arm", "gripper": None},
+        "limits": PROFILE.limits.model_dump(mode="json"),
+    }
+    (tmp_path / "lab.yaml").write_text(yaml.safe_dump({"extends": "panda_sim", **here}))
+    driver = PythonDriver(load_profile(str(tmp_path / "lab.yaml")))
+    Report(driver)
+    robot, now_ns = driver.robot, 10**12
+    for wrist in (3.1, -3.1, -3.0):
+        robot.at, now_ns = [*HOME_RAD[:5], wrist], now_ns + 10**9
+        measured = driver.read(now_ns)
+    assert measured.joints.position_rad[5] == pytest.approx(TURN - 3.0)
+    goal = np.array([*HOME_RAD[:5], TURN - 2.98])
+    driver.move(JointReference.at_rest(goal), 0)
+    assert robot.moved[-1] == pytest.approx([*HOME_RAD[:5], -2.98])
