@@ -18,7 +18,7 @@ from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import Kinematics, home_orientation
 from vla_zenoh.kinematics.so3 import quat_from_rotation
-from vla_zenoh.policy.meaning import nearest_turn, toward, wrapped
+from vla_zenoh.policy.meaning import TURN_RAD, nearest_turn, toward, wrapped
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.driver import Measurement
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
@@ -173,10 +173,13 @@ class JointReading:
         self._home_quat = home_orientation(profile, kinematics)
         at = [kinematics.arm_joints.index(name) for name in robot.arm_joints]
         lower_rad, upper_rad = (ends_rad[at] for ends_rad in kinematics.sampled_rad)
-        self._endless = kinematics.endless[at]
+        self._endless = tuple(itertools.compress(robot.arm_joints, kinematics.endless[at]))
+        kinds = [kinematics.described.joints[name].kind for name in robot.arm_joints]
+        within_turn = upper_rad - lower_rad <= TURN_RAD
+        self._turns = (np.array(kinds) == "continuous") & within_turn
         self._middle_rad = (lower_rad + upper_rad) / 2
         furthest_rad = BEYOND * (upper_rad - lower_rad) / 2
-        self._furthest_rad = np.where(self._endless, MOST_TURNED_RAD, furthest_rad)
+        self._furthest_rad = np.where(self._turns, MOST_TURNED_RAD, furthest_rad)
         self._fastest_rad_s = BEYOND * kinematics.velocity_rad_s[at]
         self._arm_newness, self._finger_newness = StampFilter(), StampFilter()
         self.joints: JointState | None = None
@@ -217,10 +220,9 @@ class JointReading:
             velocity = _finite("velocity", joints.velocity[at])
             self._check(velocity, self._fastest_rad_s, velocity, "rad/s")
         self._arm_newness.check(made_ns)
-        endless = tuple(itertools.compress(self.arm_joints, self._endless))
         try:
             state = JointState(
-                self.arm_joints, position, velocity, self._effort(joints, at), endless=endless
+                self.arm_joints, position, velocity, self._effort(joints, at), endless=self._endless
             )
         except RecordError as error:
             raise CodecError("invalid", str(error)) from error
@@ -229,12 +231,15 @@ class JointReading:
         return state
 
     def _counted(self, reported_rad: FloatArray) -> FloatArray:
-        """The positions (n,) with endless joints counted over turns."""
-        last = self.joints
-        here = (
-            wrapped(reported_rad) if last is None else nearest_turn(reported_rad, last.position_rad)
-        )
-        return np.where(self._endless, here, reported_rad)
+        """The positions (n,) with joints that turn counted, from within half a turn of the middle.
+
+        They have no end, or a range within one turn that the profile gives them.
+        """
+        if self.joints is None:
+            here_rad = self._middle_rad + wrapped(reported_rad - self._middle_rad)
+        else:
+            here_rad = nearest_turn(reported_rad, self.joints.position_rad)
+        return np.where(self._turns, here_rad, reported_rad)
 
     def _check_locked(self, joints: Joints, places: dict[str, int]) -> None:
         """Reject states in which a joint that is not commanded is not where poses assume it."""

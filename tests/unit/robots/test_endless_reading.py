@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.robots.joint_reading import JointReading
 from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types import FloatArray, JointReference, JointState
@@ -76,6 +76,17 @@ def test_it_is_counted_over_turns_however_it_is_reported(
         assert back == pytest.approx(robot.said(true_rad), abs=1e-9)
     assert (counted - first)[TURNS] == pytest.approx(sum(steps), abs=1e-6)
     assert counted[~TURNS] == pytest.approx(true_rad[~TURNS])
+
+
+def test_a_range_of_the_profile_is_read_as_one_however_it_is_wrapped() -> None:
+    ranges = [None, None, None, None, None, [0.5, 6.0]]
+    ended = override(PROFILE, {"robot": {"joint_range_rad": ranges}})
+    reading = JointReading(ended, make_kinematics(ended))
+    joints = Joints(STAMP_NS, NAMES, np.array([*HOME_RAD[:5], -1.0]), None, None)
+    taken = reading.take(joints, STAMP_NS)
+    assert taken is not None
+    assert taken.position_rad[5] == pytest.approx(TURN - 1.0)
+    assert taken.endless == ENDLESS[:2]
 
 
 def test_a_velocity_that_is_not_reported_is_that_of_the_turning() -> None:
