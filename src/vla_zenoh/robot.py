@@ -45,7 +45,8 @@ class Reading:
 
     Args:
         position_rad: (n,) of the joints, in the order of ``robot.arm_joints``; m for prismatic
-            joints.
+            joints. One that turns without an end may be counted over turns or wrapped anywhere: its
+            commands are near to the last reading.
         velocity_rad_s: (n,); None: not measured, computed from differences of the position.
         effort_nm: (n,); None: not measured. Where it is the external torque alone, set
             ``limits.contact.effort_stop_nm`` to have it monitored.

@@ -19,7 +19,7 @@ from vla_zenoh.kinematics.kinematics import InverseKinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import ChunkPrefix
-from vla_zenoh.policy.meaning import joints_as
+from vla_zenoh.policy.meaning import joints_as, nearest_turn
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState, Task
@@ -72,6 +72,7 @@ class Answers:
         self._kinematics = make_kinematics(profile)
         self._in_chain = [self._joints.index(name) for name in self._kinematics.arm_joints]
         self._in_profile = [self._kinematics.arm_joints.index(name) for name in self._joints]
+        self._endless = self._kinematics.endless[self._in_profile]
         home_rad = np.array(profile.robot.home_rad)
         self._inverse = InverseKinematics(
             self._kinematics, home_rad[self._in_chain], joint_margin_rad=0.0
@@ -128,7 +129,7 @@ class Answers:
             raise CodecError("task", "task is empty, and the model needs a prompt")
         still, state = np.zeros(len(joints_rad)), dict[str, Any]()
         if "joint" in spec.state:
-            endless = itertools.compress(self._joints, self._kinematics.endless[self._in_profile])
+            endless = itertools.compress(self._joints, self._endless)
             measured = JointState(self._joints, joints_rad, still, still, endless=tuple(endless))
             state["joint"] = joints_as(measured, self._policy.spec.action.turns)
         if "gripper" in spec.state:
@@ -147,6 +148,8 @@ class Answers:
         if not goal or self._target is None:
             return joints_rad, width_m
         target_rad, target_m = self._target
+        near_rad = nearest_turn(target_rad, joints_rad)
+        target_rad = np.where(self._endless, near_rad, target_rad)
         if np.abs(target_rad - joints_rad).max() > ARRIVED_RAD:
             return joints_rad, width_m
         return target_rad, target_m
@@ -167,7 +170,7 @@ class Answers:
             first_rad = np.empty(len(order))
             first_rad[order] = start_rad
             endless = np.empty(len(order), bool)
-            endless[order] = self._kinematics.endless[self._in_profile]
+            endless[order] = self._endless
             before_rad = first_rad
             for step in steps:
                 before_rad = step_joints(action, step, before_rad, first_rad, endless)

@@ -17,6 +17,7 @@ from vla_zenoh.bus.buffers import CallbackRing, LatestSample, Wake, bytes_of
 from vla_zenoh.client.client import StopClient, StopOutcome
 from vla_zenoh.client.remote_robot import RemoteRobot
 from vla_zenoh.errors import CountedError, SessionError, VlaZenohError
+from vla_zenoh.policy.meaning import joints_as
 from vla_zenoh_strands import wire
 from vla_zenoh_strands.link import Link
 from vla_zenoh_strands.mandate import Mandate
@@ -123,7 +124,7 @@ class Peer:
         """Joints in rad and rad/s, and what the arm does."""
         found: Message = {"peer_id": self._keys.us, "t": time.time(), "task": self._task()}
         try:
-            joints = self._robot.joint_state(0.0).record
+            joints = joints_as(self._robot.joint_state(0.0).record, "wrapped")
         except (SessionError, CountedError):
             return found
         numbers = zip(joints.names, joints.position_rad, joints.velocity_rad_s, strict=True)
