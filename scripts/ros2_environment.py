@@ -4,10 +4,11 @@
     .venv/bin/python scripts/ros2_environment.py --path jazzy      # its Python, if it is there
 
 ROS 2's wheels are for Python 3.11. tests/ros2/ros_side/DISTRIBUTION.txt has their versions. The
-interfaces that no wheel has are built with the wheels' own rosidl: those of this package
-(src/vla_zenoh/ros2/text) and tests/ros2/ros_side/interfaces. An environment is kept in the user's
-cache folder, as the bridge is, and made anew only when one of these files changes. Needs CMake, a
-C++ compiler and Python's headers; ``--packages`` prints what Debian lacks of them.
+interfaces that no wheel has are built with the wheels' own rosidl: those of the package
+plugins/vla-zenoh-ros2 (its folder ``text``) and tests/ros2/ros_side/interfaces. An environment is
+kept in the user's cache folder, as the bridge is, and made anew only when one of these files
+changes. Needs CMake, a C++ compiler and Python's headers; ``--packages`` prints what Debian lacks
+of them.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from bootstrap import uv_environment
 ROOT = Path(__file__).resolve().parent.parent
 TESTS = ROOT / "tests" / "ros2" / "ros_side"
 CMAKE = TESTS / "interfaces" / "CMakeLists.txt"
-OWN_TEXT = ROOT / "src" / "vla_zenoh" / "ros2" / "text"
+OWN_TEXT = ROOT / "plugins" / "vla-zenoh-ros2" / "src" / "vla_zenoh_ros2" / "text"
 PACKAGES = {
     "tf2_msgs": (TESTS / "interfaces", ("geometry_msgs",)),
     "franka_msgs": (OWN_TEXT, ("action_msgs",)),

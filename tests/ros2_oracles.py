@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
+from vla_zenoh_ros2.messages import Messages
 
 from benchmarks.codec.other_cdr import EMPTY
-from vla_zenoh.ros2.messages import Messages
 
 _texts = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=20)
 MAX_ITEMS = 4

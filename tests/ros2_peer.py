@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import zenoh
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
+from vla_zenoh_ros2.messages import Messages
 
 from vla_zenoh.kinematics.kinematics import InverseKinematics
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
-from vla_zenoh.ros2.messages import Messages
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 GOAL = "multi_mode_control_msgs/msg/CartesianImpedanceGoal"

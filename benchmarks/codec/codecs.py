@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.readers import READERS, read
 from vla_zenoh_ros2.writers import POSE_STAMPED, Stamp, header, pose_writer
 
 from benchmarks.codec.other_cdr import MODULES, OtherCdr
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import decode_jpeg, decode_raw, encode_jpeg, encode_raw, raw_schema
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import ActionChunk, Image, JointState, PoseCommand
 
 HEIGHT, WIDTH = 480, 640

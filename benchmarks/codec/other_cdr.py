@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-
-from vla_zenoh.ros2.messages import Messages
+from vla_zenoh_ros2.messages import Messages
 
 MODULES = {"cyclonedds": "cyclonedds.idl", "pycdr2": "pycdr2"}
 """Library -> its module of structures; that of types lies in it."""

@@ -32,6 +32,7 @@ from vla_zenoh_r2c import wire as r2c
 from vla_zenoh_ros2 import readers
 from vla_zenoh_ros2.bridge_view import read_view
 from vla_zenoh_ros2.keys import Attachment
+from vla_zenoh_ros2.messages import Messages, parse
 from vla_zenoh_ros2.pictures import COMPRESSED_IMAGE, IMAGE
 from vla_zenoh_ros2.ros_names import domains_of_bridges, domains_of_rmw
 from vla_zenoh_serve import openpi_server
@@ -55,7 +56,6 @@ from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
-from vla_zenoh.ros2.messages import Messages, parse
 from vla_zenoh.types import ClockReply, Depth, Event, Header, InferenceDebug, NodeStatus
 
 ENTITY = "@/b1/ros2/dds/010f00/writer/1/rt/joint_states"

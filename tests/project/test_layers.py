@@ -31,7 +31,7 @@ ORDER = (
     ("kinematics",),
     ("control",),
     ("guard",),
-    ("ros2", "security", "simulation"),
+    ("security", "simulation"),
     ("bus",),
     ("client",),
     ("runtime",),

@@ -14,10 +14,10 @@ import zenoh
 from camera_rig import free_endpoint, until
 from vla_zenoh_ros2 import readers, writers
 from vla_zenoh_ros2.keys import SENSOR, Endpoint, EntityRole, Ros2Dds
+from vla_zenoh_ros2.messages import Messages
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import SessionProfile
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import PoseCommand
 
 if TYPE_CHECKING:

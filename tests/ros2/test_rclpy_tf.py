@@ -25,10 +25,10 @@ from rclpy_rig import (
     heard,
     running_ros_lab,
 )
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.transforms import TF_MESSAGE, Edge, FrameTree, read_transforms, tf_message
 
 from vla_zenoh.codec.image import decode_depth
-from vla_zenoh.ros2.messages import Messages
 
 pytestmark = pytest.mark.rclpy
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-
-from vla_zenoh.ros2.messages import Messages
+from vla_zenoh_ros2.messages import Messages
 
 pytest.importorskip("ros_messages", exc_type=ImportError)
 

@@ -25,6 +25,7 @@ from camera_rig import until
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_rig import write_profile
 from vla_zenoh_ros2.driver import Ros2Driver
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.readers import IMAGE, JOINT_STATE, read
 from vla_zenoh_ros2.ros_graph import Request, RosGraph
 
@@ -34,7 +35,6 @@ from vla_zenoh.codec import records
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.robot import Ros2Profile
 from vla_zenoh.robots.node import RobotNode
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import PoseState
 
 pytestmark = [pytest.mark.ros2, pytest.mark.slow]

@@ -14,6 +14,7 @@ from camera_rig import until
 from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
 from vla_zenoh_ros2.gripper import Gripper
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.readers import SUCCEEDED
 from vla_zenoh_ros2.ros_graph import RosGraph
 
@@ -25,7 +26,6 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.arm import GripperCommands
 from vla_zenoh.robots.driver import RobotDriver
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import GripperCommand
 
 HOUR_NS = 3_600_000_000_000

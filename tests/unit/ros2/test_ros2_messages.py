@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ros2_oracles import plain, random_messages
 from vla_zenoh_ros2 import readers
+from vla_zenoh_ros2.messages import NO_HASH, STORES, Messages
 
 from benchmarks.codec.other_cdr import MODULES, OtherCdr
+from vla_zenoh.codec.cdr import MAX_MESSAGE_BYTES
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, NO_HASH, STORES, Messages
 
 JAZZY = Messages("jazzy")
 SPOKEN = (

@@ -19,6 +19,7 @@ from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
 from vla_zenoh_ros2 import operator_topics
 from vla_zenoh_ros2.keys import BOOL, EMPTY, OPERATIONS, TEXT
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.middleware import Bridges
 from vla_zenoh_ros2.operator_topics import OperatorTopics
 from vla_zenoh_ros2.ros_graph import RosGraph
@@ -29,7 +30,6 @@ from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import load_profile
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import Header, Task
 
 PATIENCE_S = 30.0

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.pictures import COLOURS, COMPRESSED_IMAGE, DEPTHS, IMAGE
 from vla_zenoh_ros2.readers import read, read_depth
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.ros2.messages import Messages
 
 JAZZY = Messages("jazzy")
 HEIGHT, WIDTH = 12, 16

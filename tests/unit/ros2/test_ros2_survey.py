@@ -17,6 +17,7 @@ from camera_rig import free_endpoint
 from described_arms import SIX, TOOL, arm, urdf
 from typer.testing import CliRunner
 from vla_zenoh_ros2.keys import Endpoint, EntityRole, Qos, RmwZenoh
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.proposal import CONTROLLER_STATE
 from vla_zenoh_ros2.survey import DEFINITIONS, GET_PARAMETERS, Survey, survey
 
@@ -25,7 +26,6 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import PluginError, ResourceError, SessionError
 from vla_zenoh.profile import SessionProfile, load_profile, simulated
 from vla_zenoh.program.main import app
-from vla_zenoh.ros2.messages import Messages
 
 JOINT_STATE, TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 NUMBERS = "std_msgs/msg/Float64MultiArray"

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from vla_zenoh_ros2 import readers
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.readers import GripperOutcome, RosImage, outcome
 from vla_zenoh_ros2.writers import (
     DIAGNOSTICS,
@@ -28,7 +29,6 @@ from vla_zenoh_ros2.writers import (
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.robot import Ros2Gripper
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import GripperCommand, JointCommand, NodeStatus, PoseCommand
 
 M = Messages(

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.transforms import (
     MAX_FRAMES,
     TF_MESSAGE,
@@ -20,7 +21,6 @@ from vla_zenoh_ros2.transforms import (
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.kinematics.so3 import rotation_from_rpy
-from vla_zenoh.ros2.messages import Messages
 
 M = Messages("jazzy")
 QUARTER = rotation_from_rpy(np.array([0.0, 0.0, np.pi / 2]))

@@ -19,11 +19,11 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
 from vla_zenoh.robots.joint_reading import JointReading, RobotClock, SimulatedClock, wall_stamp_ns
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState, JointState
 from vla_zenoh.types.records import JointReference, Joints, PoseReference
 from vla_zenoh_ros2.gripper import Gripper
 from vla_zenoh_ros2.keys import COMMAND, SENSOR
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.readers import JOINT_STATE, WRENCH, Wrench, read
 from vla_zenoh_ros2.ros_graph import RosGraph
 from vla_zenoh_ros2.writers import Stamp, Write, joint_writer, pose_writer

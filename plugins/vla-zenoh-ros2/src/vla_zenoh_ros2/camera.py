@@ -15,9 +15,9 @@ from vla_zenoh.nodes.camera.geometry import Pixels, resize
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
 from vla_zenoh.profile.robot import Ros2Camera
 from vla_zenoh.robots.joint_reading import SimulatedClock, StampFilter, wall_stamp_ns
-from vla_zenoh.ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh.types import Event
 from vla_zenoh_ros2.keys import SENSOR
+from vla_zenoh_ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh_ros2.readers import RosDepth, RosImage, read, read_depth
 from vla_zenoh_ros2.ros_graph import RosGraph
 

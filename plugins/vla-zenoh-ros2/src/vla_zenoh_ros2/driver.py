@@ -22,13 +22,13 @@ from vla_zenoh.profile.robot import Ros2Profile
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
 from vla_zenoh.robots.joint_reading import SimulatedClock
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.types import Event
 from vla_zenoh.types.records import JointReference, PoseReference
 from vla_zenoh_ros2.arm import NAME, Ros2Arm
 from vla_zenoh_ros2.camera import Camera
 from vla_zenoh_ros2.frames import FrameTopics
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.middleware import Bridges, MiddlewareWatch, bridge_session, gripper_fault
 from vla_zenoh_ros2.operator_topics import OperatorTopics
 from vla_zenoh_ros2.ros_graph import RosGraph

@@ -16,18 +16,19 @@ import numpy as np
 import pinocchio as pin
 
 from vla_zenoh.bus.buffers import CallbackRing
+from vla_zenoh.codec.cdr import MAX_MESSAGE_BYTES
 from vla_zenoh.errors import CodecError
 from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation, rotation_from_rpy
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import CameraMount
-from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, Messages
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, FloatArray
 from vla_zenoh.types.records import JointReference, PoseReference
 from vla_zenoh_ros2.arm import Ros2Arm
 from vla_zenoh_ros2.camera import Camera
 from vla_zenoh_ros2.keys import LATCHED, SENSOR, Qos
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.ros_graph import RosGraph
 from vla_zenoh_ros2.transforms import (
     TF,

@@ -18,10 +18,10 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile import GripperProfile, Profile
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import Event, GripperCommand
 from vla_zenoh_ros2 import writers
 from vla_zenoh_ros2.keys import COMMAND
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.readers import outcome
 from vla_zenoh_ros2.ros_graph import CALL_S, RosGraph, ServiceClient
 from vla_zenoh_ros2.writers import GRASP

@@ -16,7 +16,7 @@ from hashlib import blake2b
 from typing import NamedTuple
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.ros2.messages import split_type
+from vla_zenoh_ros2.messages import split_type
 
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 _SLASH_OF_BRIDGES = "§"

@@ -23,7 +23,6 @@ from vla_zenoh.client.client import Client
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.profile import Profile
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh_ros2.keys import (
     ACTIVE,
     ANSWER_TOPIC,
@@ -39,6 +38,7 @@ from vla_zenoh_ros2.keys import (
     TEXT,
     Operation,
 )
+from vla_zenoh_ros2.messages import Messages
 from vla_zenoh_ros2.middleware import Bridges
 from vla_zenoh_ros2.readers import Wanted, read, read_request
 from vla_zenoh_ros2.ros_graph import Request, RosGraph

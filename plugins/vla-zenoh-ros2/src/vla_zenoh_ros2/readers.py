@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_zenoh.codec.cdr import MAX_MESSAGE_BYTES
 from vla_zenoh.errors import CodecError
-from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, SECOND_NS, Messages
 from vla_zenoh.types import MAX_NAMES, FloatArray
 from vla_zenoh.types.records import Joints
 from vla_zenoh_ros2.keys import BOOL, TEXT
+from vla_zenoh_ros2.messages import MAX_PICTURE_BYTES, SECOND_NS, Messages
 from vla_zenoh_ros2.pictures import (
     COMPRESSED_IMAGE,
     IMAGE,

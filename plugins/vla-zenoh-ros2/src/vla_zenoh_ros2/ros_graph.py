@@ -15,7 +15,6 @@ import zenoh.ext
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile.robot import Ros2Profile
-from vla_zenoh.ros2.messages import Messages
 from vla_zenoh_ros2.keys import (
     DEFAULT,
     Attachment,
@@ -28,6 +27,7 @@ from vla_zenoh_ros2.keys import (
     gid_of,
     parts_of,
 )
+from vla_zenoh_ros2.messages import Messages
 
 Buffer = TypeVar("Buffer", LatestSample, CallbackRing)
 

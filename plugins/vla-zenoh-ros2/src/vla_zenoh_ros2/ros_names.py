@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from vla_zenoh.ros2.messages import NO_HASH
 from vla_zenoh_ros2.bridge_view import SERVES, Replies, read_json, read_view, vendor_of
 from vla_zenoh_ros2.keys import EntityRole, read_token, ros_type
+from vla_zenoh_ros2.messages import NO_HASH
 
 ENTITIES = "@/*/ros2/dds/*/*/*/**"
 """Key expression of the bridges' writers and readers in DDS."""

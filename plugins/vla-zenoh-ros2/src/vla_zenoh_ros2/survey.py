@@ -14,10 +14,10 @@ import zenoh
 
 from vla_zenoh.bus.buffers import CallbackRing, bytes_of
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.codec.cdr import MAX_MESSAGE_BYTES
 from vla_zenoh.errors import CodecError, ResourceError, SessionError
 from vla_zenoh.profile import SessionProfile
 from vla_zenoh.profile.robot import Ros2Profile
-from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
 from vla_zenoh_ros2.bridge_view import CONFIGS, MAX_REPLY_BYTES
 from vla_zenoh_ros2.keys import (
     LATCHED,
@@ -28,6 +28,7 @@ from vla_zenoh_ros2.keys import (
     EntityRole,
     RmwZenoh,
 )
+from vla_zenoh_ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh_ros2.proposal import (
     CONTROLLER_STATE,
     HeardImages,

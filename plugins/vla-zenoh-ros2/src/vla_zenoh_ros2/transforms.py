@@ -14,9 +14,9 @@ import numpy as np
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.kinematics.so3 import quat_from_rotation, rotation_from_quat
-from vla_zenoh.ros2.messages import SECOND_NS, Messages
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import FloatArray
+from vla_zenoh_ros2.messages import SECOND_NS, Messages
 from vla_zenoh_ros2.writers import Stamp, header
 
 TF, TF_STATIC, TF_MESSAGE = "/tf", "/tf_static", "tf2_msgs/msg/TFMessage"

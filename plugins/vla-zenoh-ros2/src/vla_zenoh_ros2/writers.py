@@ -18,9 +18,9 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.robot import Ros2Gripper
-from vla_zenoh.ros2.messages import SECOND_NS, Messages
 from vla_zenoh.types import FloatArray, GripperCommand, JointCommand, NodeStatus, PoseCommand
 from vla_zenoh_ros2.keys import LOG
+from vla_zenoh_ros2.messages import SECOND_NS, Messages
 
 POSE, POSE_STAMPED = "geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"

@@ -17,25 +17,26 @@ from vla_zenoh.errors import CodecError, MissingExtraError
 from vla_zenoh.types import JointCommand, JointState, ObjectPoses, PoseCommand, PoseState
 
 if TYPE_CHECKING:
-    from vla_zenoh.ros2.messages import Messages
+    from vla_zenoh.codec.cdr import CdrMessages
 
 IMAGE, JPEG_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 POSE, POSES = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseArray"
 JOINTS, TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 LAST_SECOND = 2**31
 MAX_MESSAGE_BYTES = 256 * 1024 * 1024
-DISTRIBUTION = "humble"
-"""Later distributions have the same standard messages."""
 
 
 @cache
-def messages() -> Messages:
+def messages() -> CdrMessages:
     """The message types of ROS 2. Raises MissingExtraError: rosbags is not installed."""
     try:
-        from vla_zenoh.ros2.messages import Messages
+        from rosbags.typesys import Stores, get_typestore
+
+        from vla_zenoh.codec.cdr import CdrMessages
     except ImportError as error:
         raise MissingExtraError("rosbags", "record") from error
-    return Messages(DISTRIBUTION)
+    # Later distributions have the same standard messages.
+    return CdrMessages(get_typestore(Stores.ROS2_HUMBLE))
 
 
 def schema_text(name: str) -> bytes:

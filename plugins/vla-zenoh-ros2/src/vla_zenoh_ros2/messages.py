@@ -1,15 +1,13 @@
 """All message types of one ROS 2 distribution: values, CDR both ways, and type hashes.
 
-Built on rosbags, with services and actions, the definitions of this package, and decoders that
-raise nothing but `CodecError`, whatever the bytes. A service or action is several messages. What
-ROS generates for them (request, response, goal id, status, ...) is made here, so that their hashes
-are those of the real thing.
+Built on rosbags, with services and actions, and the definitions of this package. A service or
+action is several messages. What ROS generates for them (request, response, goal id, status, ...) is
+made here, so that their hashes are those of the real thing.
 """
 
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Mapping
 from copy import copy
 from pathlib import Path
@@ -17,10 +15,10 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from vla_zenoh.errors import CodecError, ProfileError, nearest
+from vla_zenoh.codec.cdr import CdrMessages
+from vla_zenoh.errors import ProfileError, nearest
 
 STORES = {
     "humble": Stores.ROS2_HUMBLE,
@@ -34,12 +32,8 @@ STORES = {
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)")
 NO_HASH = "TypeHashNotSupported"
 """In place of a hash where the distribution has none (Humble)."""
-MAX_MESSAGE_BYTES = 4 * 1024 * 1024
 MAX_PICTURE_BYTES = 128 * 1024 * 1024
 SECOND_NS = 1_000_000_000
-HEADER_BYTES = 4
-"""In front of CDR: two for its representation, two of options, which nobody uses."""
-_BIG_ENDIAN, _LITTLE_ENDIAN = b"\0\0", b"\0\1"
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _SEPARATOR = "---"
 _SUFFIXES = (".msg", ".srv", ".action")
@@ -60,7 +54,7 @@ def split_type(kind: str) -> tuple[str, str, str]:
     return match[1], match[2], match[3]
 
 
-class Messages:
+class Messages(CdrMessages):
     """Message types of one ROS 2 distribution.
 
     Args:
@@ -76,8 +70,8 @@ class Messages:
             raise ProfileError(
                 f"{distribution!r} is not a ROS distribution we know: {', '.join(STORES)}"
             )
+        super().__init__(get_typestore(STORES[distribution]))
         self.distribution = distribution
-        self._store = get_typestore(STORES[distribution])
         shipped_too = {
             kind: text for kind, text in shipped().items() if kind not in self._store.fielddefs
         }
@@ -129,11 +123,6 @@ class Messages:
             if name != "structure_needs_at_least_one_member"
         }
 
-    @property
-    def types(self) -> Mapping[str, Any]:
-        """Type -> its class, which takes all fields in order."""
-        return self._store.types
-
     def definition(self, kind: str) -> str:
         """Text of a message and of all that it is made of, as bags and MCAP files keep it."""
         return self._hashed.generate_msgdef(kind, ros_version=2)[0]
@@ -161,41 +150,6 @@ class Messages:
         if inner == Nodetype.BASE and of[0] != "string":
             return np.zeros(count, np.dtype(of[0]))
         return [self._zero((inner, of)) for _ in range(count)]
-
-    # -- CDR ----------------------------------------------------------------------------------
-    def encode(self, message: Any) -> bytes:
-        """CDR, little-endian, with its header; a `CodecError` if a value does not fit its field."""
-        kind: str = message.__msgtype__
-        try:
-            return bytes(self._store.serialize_cdr(message, kind, little_endian=True))
-        except (SerdeError, struct.error, ValueError, TypeError, AttributeError) as error:
-            raise CodecError("unencodable", f"{kind}: {str(error)[:200]}") from error
-
-    def decode(self, kind: str, payload: bytes, limit: int = MAX_MESSAGE_BYTES) -> Any:
-        """A message of `kind`; its arrays are views into `payload` and read-only.
-
-        As ROS subscribers do, it leaves out what stands behind the message: padding, or the rest
-        of a buffer that was larger.
-
-        Raises:
-            CodecError: ``oversize`` (more than `limit` bytes) or ``malformed``.
-        """
-        if len(payload) > limit:
-            raise CodecError("oversize", f"{kind} of {len(payload)} bytes, at most {limit}")
-        try:
-            return self._deserialize(kind, payload)
-        except (SerdeError, struct.error, ValueError, IndexError, OverflowError) as error:
-            raise CodecError("malformed", f"{kind}: {str(error)[:200]}") from error
-
-    def _deserialize(self, kind: str, payload: bytes) -> Any:
-        representation = payload[:2]
-        if representation not in (_BIG_ENDIAN, _LITTLE_ENDIAN) or len(payload) < HEADER_BYTES:
-            raise CodecError(
-                "malformed", f"{kind}: no plain CDR, but representation {representation.hex()!r}"
-            )
-        of = self._store.get_msgdef(kind)
-        read = of.deserialize_cdr_le if representation == _LITTLE_ENDIAN else of.deserialize_cdr_be
-        return read(memoryview(payload)[HEADER_BYTES:], 0, of.cls, self._store)[0]
 
     # -- hashes -------------------------------------------------------------------------------
     def hash(self, kind: str) -> str:

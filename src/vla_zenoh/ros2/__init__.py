@@ -1,1 +1,0 @@
-"""ROS 2 without ROS: the messages of its distributions, with their type hashes and CDR."""
