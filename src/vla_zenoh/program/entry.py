@@ -24,13 +24,23 @@ UNHINDERED = ("stop", "up")
 """Commands that an output which cannot be written must not end: a full disk, a reader that left."""
 
 
-class _Lossy(io.FileIO):
+class _Lossy:
     """An output that loses what cannot be written."""
 
-    def write(self, text: Any) -> int:
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
         with suppress(OSError):
-            return super().write(text)
+            self._stream.write(text)
         return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
 
 
 def main() -> None:
@@ -79,11 +89,11 @@ def _open_outputs() -> None:
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         pass
     os.close(number)
-    made = _Lossy if sys.argv[1:2] and sys.argv[1] in UNHINDERED else io.FileIO
     for number, name in ((1, "stdout"), (2, "stderr")):
-        if made is _Lossy or getattr(sys, name) is None:
-            buffer = io.BufferedWriter(made(number, "w", closefd=False))
-            setattr(sys, name, io.TextIOWrapper(buffer, "utf-8", "replace", line_buffering=True))
+        if getattr(sys, name) is None:
+            setattr(sys, name, io.TextIOWrapper(io.FileIO(number, "w", closefd=False)))
+        if sys.argv[1:2] and sys.argv[1] in UNHINDERED:
+            setattr(sys, name, _Lossy(getattr(sys, name)))
 
 
 def _sentence(error: Exception) -> str | None:
