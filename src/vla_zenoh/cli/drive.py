@@ -56,9 +56,9 @@ def prompt(
     answer it stands timing.max_open_loop_s and watchdog_s after the last chunk, 2.8 s by default.
     `vla-zenoh speed 0` or `deactivate` stop it before that.
     """
-    from vla_zenoh.codec.settings import decode_text
+    from vla_zenoh.codec.settings import decode_text, encode_text
 
-    if not decode_text(text.encode()):  # rejects it before a router is asked
+    if not decode_text(encode_text(text)):  # rejects it before a router is asked
         raise CodecError(
             "invalid",
             "the prompt is empty: give the task in words, as in "
@@ -165,9 +165,9 @@ def use(
     as_json: AnswerOption = False,
 ) -> None:
     """Select the worker that moves the arm; the others keep running."""
-    from vla_zenoh.codec.settings import decode_name
+    from vla_zenoh.codec.settings import decode_name, encode_text
 
-    decode_name(worker.encode())
+    decode_name(encode_text(worker))
     with target.operator("use", worker) as client:
         _require_worker(client, worker)
         _show(target, client, f"worker: {client.set_worker(worker).worker}")
@@ -213,9 +213,9 @@ def speed(
     as_json: AnswerOption = False,
 ) -> None:
     """Slow the arm down on the same path. Lowering needs only the right to stop."""
-    from vla_zenoh.codec.settings import decode_percent
+    from vla_zenoh.codec.settings import decode_percent, encode_text
 
-    wanted = None if percent is None else decode_percent(percent.encode())
+    wanted = None if percent is None else decode_percent(encode_text(percent))
     with target.client(stop=wanted is not None) as client:
         task = client.wait_for(lambda: client.task, PATIENCE_S)
         if task is None:

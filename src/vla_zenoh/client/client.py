@@ -488,7 +488,7 @@ class Client(StopClient):
         Raises:
             SessionError: it was rejected, with the reasons, or not accepted in time.
         """
-        wanted = settings.decode_text(prompt.encode())
+        wanted = settings.decode_text(settings.encode_text(prompt))
         return self._set("prompt", prompt, lambda task: task.prompt == wanted, timeout_s)
 
     def set_rate(self, rate_hz: float, timeout_s: float | None = None) -> Task:
@@ -520,7 +520,7 @@ class Client(StopClient):
         Raises:
             CodecError: it cannot be a worker's name.
         """
-        settings.decode_name(worker.encode())
+        settings.decode_name(settings.encode_text(worker))
         return self._set("worker", worker, lambda task: task.worker == worker, timeout_s)
 
     def activate(self, timeout_s: float | None = None, holder: str = "") -> Task:

@@ -25,6 +25,11 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?
 MAX_SEED_DIGITS = 10
 
 
+def encode_text(text: str) -> bytes:
+    """UTF-8; half a character (a surrogate) stays, and the decoders reject it."""
+    return text.encode("utf-8", "surrogatepass")
+
+
 def decode_text(payload: bytes) -> str:
     """UTF-8 text without control characters, white space trimmed."""
     if len(payload) > MAX_SETTING_BYTES:

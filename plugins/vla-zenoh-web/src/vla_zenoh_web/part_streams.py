@@ -10,7 +10,7 @@ import zenoh
 
 from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing, bytes_of, header_of
 from vla_zenoh.codec import records
-from vla_zenoh.codec.settings import decode_held
+from vla_zenoh.codec.settings import decode_held, encode_text
 from vla_zenoh.errors import CodecError, RecordError, SpecError, VlaZenohError
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
@@ -125,7 +125,7 @@ class PartStreams:
         if pose is not None:
             found["measured_m"] = rounded([pose.position_m])[0]
             found["speed_m_s"] = round(float(np.linalg.norm(pose.twist[:3])), 4)
-        box = decode_held(holds.encode())
+        box = decode_held(encode_text(holds))
         if isinstance(box, HeldBox):
             found["holds"] = holds
             if pose is not None:

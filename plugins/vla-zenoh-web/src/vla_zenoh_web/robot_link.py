@@ -17,7 +17,7 @@ from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
 from vla_zenoh.client.client import Client, StopOutcome
 from vla_zenoh.client.primitives import ask
 from vla_zenoh.codec import records
-from vla_zenoh.codec.settings import decode_held
+from vla_zenoh.codec.settings import decode_held, encode_text
 from vla_zenoh.errors import (
     CodecError,
     RecordError,
@@ -144,7 +144,7 @@ class RobotLink:
         """
         if part not in self._parts:
             raise SessionError(f"the robot has no part {part!r}")
-        box = decode_held(text.encode())
+        box = decode_held(encode_text(text))
         began_s = time.monotonic()
         self.client.publish(self.keys.of_part(part).held if part else self.keys.held, str(box))
 
