@@ -101,7 +101,7 @@ def check_seams(loop: Lockstep) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("horizon", [1, pytest.param(8, marks=pytest.mark.slow), 50])
+@pytest.mark.parametrize("horizon", [1, 8, 50])
 @pytest.mark.parametrize("late", DELAYS)
 def test_every_mode_ends_where_the_steps_end(mode: str, horizon: int, late: str) -> None:
     rate_hz, count = 6.0, 10

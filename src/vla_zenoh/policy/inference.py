@@ -298,8 +298,12 @@ class ChunkPrefix:
         self._busy_until = -math.inf
         """Plan time until which the arm has steps to execute of which the worker does not know."""
 
-    def set_override(self, override: float, stamp_ns: int) -> None:
-        """The speed override, 0 to 1, in force from `stamp_ns` on, wall clock; oldest first."""
+    def set_task(self, task: Task, stamp_ns: int) -> None:
+        """The task in force from `stamp_ns` on, wall clock; oldest first."""
+        override, last = task.speed, self._last
+        if last and last.episode != task.episode and last.published_ns >= stamp_ns:
+            # The command node has rejected it: the arm goes on with what it had before.
+            self._last, self._busy_until = None, last.busy_until
         if self._clock is None:
             self._clock = PlanClock(override, stamp_ns)
         if override != self._clock.override:

@@ -158,6 +158,11 @@ Overrides = tuple[tuple[float, float], ...]
 """(Time in ms, share) of the speed override, oldest first."""
 
 
+def set_override(prefix: ChunkPrefix, at_ms: float, share: float) -> None:
+    now = seen(at_ms)
+    prefix.set_task(replace(now.task, speed_percent=100.0 * share), now.stamp_wall_ns)
+
+
 def told_under(
     overrides: Overrides,
     at_ms: float,
@@ -172,12 +177,12 @@ def told_under(
     """
     model = Model()
     prefix = ChunkPrefix(model, max_age_s)
-    prefix.set_override(overrides[0][1], seen(overrides[0][0]).stamp_wall_ns)
+    set_override(prefix, *overrides[0])
     if not stood:
         prefix.published(seen(-1), ramp(), seen(-1).stamp_wall_ns, obeyed=True)
     prefix.published(seen(0), ramp(), seen(published_ms).stamp_wall_ns, obeyed=True)
     for time_ms, share in overrides[1:]:
-        prefix.set_override(share, seen(time_ms).stamp_wall_ns)
+        set_override(prefix, time_ms, share)
     task = replace(seen(at_ms).task, speed_percent=100.0 * overrides[-1][1])
     prefix.infer(replace(seen(at_ms), task=task))
     return model.told
@@ -208,9 +213,9 @@ def test_the_latency_to_come_is_counted_at_the_present_speed_override() -> None:
     assert slow.frozen == fast.frozen == 1
     very_late = Model()
     prefix = ChunkPrefix(very_late, 60.0)
-    prefix.set_override(1.0, seen(-1).stamp_wall_ns)
+    set_override(prefix, -1, 1.0)
     prefix.published(seen(0), ramp(), seen(400).stamp_wall_ns, obeyed=True)
-    prefix.set_override(0.5, seen(200).stamp_wall_ns)
+    set_override(prefix, 200, 0.5)
     prefix.infer(seen(200))
     assert very_late.told.frozen == 2
 
@@ -221,6 +226,21 @@ def test_after_a_pause_what_the_command_node_dropped_is_not_committed() -> None:
     assert kept is not None
     np.testing.assert_allclose(kept.steps[0], ramp()[1] * 0.4 + ramp()[2] * 0.6, atol=1e-2)
     assert told_under(paused, 1160, max_age_s=1.0) is None
+
+
+@pytest.mark.parametrize(("published_ms", "executed"), [(140, 2.0), (160, 1.0)])
+def test_a_chunk_that_came_after_a_new_prompt_was_not_executed(
+    published_ms: float, executed: float
+) -> None:
+    """The new episode begins at 150 ms: a chunk of before goes on until the first new one."""
+    prefix = ChunkPrefix(Model(), 60.0)
+    set_override(prefix, -1000, 1.0)
+    prefix.published(seen(0), ramp(), seen(published_ms).stamp_wall_ns, obeyed=True)
+    task = replace(seen(0).task, episode=seen(0).task.episode + 1)
+    prefix.set_task(task, seen(150).stamp_wall_ns)
+    first = replace(seen(200), task=task)
+    prefix.published(first, ramp(), seen(300).stamp_wall_ns, obeyed=True)
+    assert prefix.with_progress(replace(seen(400), task=task)).executed_steps == executed
 
 
 @given(

@@ -139,7 +139,7 @@ class RobotSession:
         """Decode what was received since the last call."""
         tasks = list(filter(None, map(self._tasks.decode, self._tasks.buffer.drain())))
         for task in tasks:  # all of them: each may have changed the speed override
-            self.prefix.set_override(task.record.speed, task.header.stamp_wall_ns)
+            self.prefix.set_task(task.record, task.header.stamp_wall_ns)
         if tasks:
             self._set_task(tasks[-1])
         for camera in self._cameras:

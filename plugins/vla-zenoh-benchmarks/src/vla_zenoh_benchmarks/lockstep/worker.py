@@ -118,7 +118,7 @@ class LockstepWorker:
 
     def take_task(self, task: Stamped[Task]) -> None:
         known, self.task = self.task, task.record
-        self._continuation.set_override(task.record.speed, task.header.stamp_wall_ns)
+        self._continuation.set_task(task.record, task.header.stamp_wall_ns)
         if known is not None and known.requested_hz != self.task.requested_hz:
             self._due_ns = min(self._due_ns, self._asked_ns)
         if known is None or known.episode != self.task.episode:
