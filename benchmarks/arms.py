@@ -13,6 +13,7 @@ import json
 import re
 import tempfile
 import time
+from itertools import compress
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -23,8 +24,10 @@ from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import VlaZenohError
+from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.profile import load_profile, override
+from vla_zenoh.policy.meaning import TURN_RAD, wrapped
+from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.program.main import app
 from vla_zenoh.resources import ROBOT_DATA_PREFIX
 from vla_zenoh.simulation.world import build_world
@@ -32,7 +35,9 @@ from vla_zenoh.simulation.world import build_world
 STEPS, STEP_M = 5, 0.01
 SECONDS = 3.0
 """For the steps at 5 Hz, and to stand again."""
-EXACT_M = 5e-4
+EXACT_M, EXACT_RAD = 5e-4, 5e-3
+TURN_RAD_S = 0.4
+TURNING = {"velocity_rad_s": 2.5}
 ROBOT_DATA = f"{ROBOT_DATA_PREFIX}{{}}"
 RTB = "rtbdata/xacro/{}"
 ROBOSUITE = "robosuite/models/assets/robots/{}/robot.xml"
@@ -114,6 +119,9 @@ class Tried(NamedTuple):
 def arms(
     packages: Annotated[Path, typer.Argument(help="Folder that the packages are installed in.")],
     match: Annotated[str, typer.Option("--match", help="Only arms whose name this matches.")] = "",
+    turns: Annotated[
+        int, typer.Option(help="Also turn the last joint without an end, by so many turns.")
+    ] = 0,
 ) -> None:
     """Make a profile of each of 23 public arms, and move it up by 5 cm in simulation."""
     typer.echo("| arm | description | joints | guesses | s | simulated motion |")
@@ -121,7 +129,7 @@ def arms(
     for arm in ARMS:
         if not re.search(match, arm.name):
             continue
-        tried = _try(arm, packages)
+        tried = _try(arm, packages, turns)
         file = arm.file.removeprefix(ROBOT_DATA_PREFIX)
         row = (
             f"{arm.name} | {arm.package}, `{Path(file).parts[-1]}` | {tried.joints or ''} | "
@@ -130,7 +138,7 @@ def arms(
         typer.echo(f"| {row} |")
 
 
-def _try(arm: PublicArm, packages: Path) -> Tried:
+def _try(arm: PublicArm, packages: Path, turns: int) -> Tried:
     began = time.monotonic()
     is_here = not arm.file.startswith(ROBOT_DATA_PREFIX)
     source = str(packages / arm.file) if is_here else arm.file
@@ -146,7 +154,55 @@ def _try(arm: PublicArm, packages: Path) -> Tried:
             fault = " ".join(f"{done.output} {done.exception}".split())
             return Tried(0, guesses, time.monotonic() - began, fault)
         joints, fault = len(load_profile(str(file)).robot.arm_joints), _moved(file)
+        if turns and not fault:
+            fault = _turned(file, turns)
     return Tried(joints, guesses, time.monotonic() - began, fault)
+
+
+class Turner:
+    """A model that turns one joint steadily from home, by positions within (-pi, pi]."""
+
+    def __init__(self, profile: Profile, joint: str, way_rad: float) -> None:
+        names = profile.robot.arm_joints
+        self.spec = ModelSpec(
+            name="turner",
+            observation=ObservationSpec(state=("joint",), prompt=False),
+            action=ActionSpec(
+                horizon=8, dt_s=0.1, kind="absolute", space="joint", joints=names, gripper="none"
+            ),
+        )
+        self._home_rad, self._way_rad = np.array(profile.robot.home_rad), way_rad
+        self._turns = np.array([name == joint for name in names])
+        self._since_s: float | None = None
+
+    def infer(self, observation: Observation) -> ActionSteps:
+        now_s = observation.stamp_wall_ns / 1e9
+        if self._since_s is None and observation.task.active:
+            self._since_s = now_s
+        passed_s = 0.0 if self._since_s is None else now_s - self._since_s
+        at_s = passed_s + 0.1 * np.arange(1, 9)[:, None]
+        rows = self._home_rad + np.minimum(TURN_RAD_S * at_s, self._way_rad) * self._turns
+        return ActionSteps(np.where(self._turns, wrapped(rows), rows))
+
+
+def _turned(file: Path, turns: int) -> str:
+    """Why its last joint without an end is not turned so often; empty: it is, or has an end."""
+    quick = {"timing": {"command_hz": 50, "state_hz": 50}, "limits": {"rotation": TURNING}}
+    profile = override(load_profile(str(file)), quick)
+    reach = ReachabilityFilter(profile)
+    endless = [*compress(reach.kinematics.arm_joints, reach.kinematics.endless)]
+    if not endless:
+        return ""
+    way_rad = turns * TURN_RAD
+    world = build_world(profile)
+    loop = Lockstep(profile, world, Turner(profile, endless[-1], way_rad), reach=reach)
+    if why := loop.activate(1.0, 0.2):
+        return why
+    start_rad = world.joint_state().position_rad
+    loop.run(way_rad / TURN_RAD_S + SECONDS)
+    ways_rad = world.joint_state().position_rad - start_rad
+    off_rad = np.abs(ways_rad - way_rad * (np.array(profile.robot.arm_joints) == endless[-1]))
+    return "" if off_rad.max() < EXACT_RAD else f"{endless[-1]} off by {off_rad.max():.3f} rad"
 
 
 def _moved(file: Path) -> str:

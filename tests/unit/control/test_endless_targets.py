@@ -133,6 +133,20 @@ def test_a_robot_that_begins_to_count_anew_is_not_turned_back(folder: Path) -> N
     assert places[-1] == pytest.approx(first + 0.1, abs=EXACT)
 
 
+def test_a_count_that_begins_anew_under_an_active_arm_ends_the_activation(folder: Path) -> None:
+    arm = Joints(endless_arm(folder))
+    arm.at(HOME + 3 * TURN * FLANGE)
+    arm.activate()
+    arm.settle(HOME, 0.8)
+    commanded = arm.joints[-1].position_rad[5]
+    arm.rig.blocked = True  # nothing of ours moves it: its guard rejects a jump
+    arm.at(wrapped(arm.joints_rad))
+    arm.run(1.0)
+    assert arm.rig.state == "inactive"
+    assert any("elbow_rad" in event.what for event in arm.rig.events)
+    assert abs(arm.joints[-1].position_rad[5] - commanded) < 0.01
+
+
 def test_numbers_of_many_turns_are_a_matter_of_the_declaration() -> None:
     names = tuple(f"joint{n}" for n in range(1, 7))
     wrapping = ActionSpec(

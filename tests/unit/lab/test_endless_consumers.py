@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from endless_arm import ENDLESS, HOME_RAD, endless_arm
+from made_arm import made_arm
 from vla_zenoh_conform.rules import RuleFinding, _joints
 from vla_zenoh_inspect.targets import Targets
 from vla_zenoh_lerobot.arm import LeRobotArm
@@ -20,6 +22,7 @@ from vla_zenoh_physicalai.layout import Layout
 from vla_zenoh_primitives.endings import Arrival, Sight
 from vla_zenoh_primitives.target_check import TargetCheck
 
+from vla_zenoh.control.joint_follower import JointFollower, JointMotion
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.kinematics import make_kinematics
@@ -27,7 +30,8 @@ from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.lab.profile.robot_check import arm as check_arm
 from vla_zenoh.lab.profile.robot_check import joints_advice
 from vla_zenoh.profile import Profile, override
-from vla_zenoh.types import GripperState, JointState, PoseState
+from vla_zenoh.simulation.impedance import CartesianImpedance, ImpedanceGains
+from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
 
 ROOT = Path(__file__).parents[3]
 HOME = np.array(HOME_RAD)
@@ -151,3 +155,35 @@ def test_units_from_end_to_end_need_ends(profile: Profile) -> None:
             zero=(),
             reversed=(),
         )
+
+
+SEVEN = "eztyeztytzexty"
+POSTURE = np.array([0.3, -0.8, 0.1, 1.6, 0.2, 3.0, 0.7])
+
+
+def test_a_redundant_arm_is_pulled_to_its_posture_as_if_it_had_never_turned(
+    tmp_path: Path,
+) -> None:
+    arm = make_kinematics(made_arm(tmp_path, SEVEN, 0.2))
+    turns = np.array([3, 0, -2, 0, 0, 9, 0]) * TURN
+    assert np.array_equal(arm.endless, turns != 0)
+    away = POSTURE + 0.2 * np.array([1, -1, 1, 1, -1, 1, 1])
+    follower = JointFollower(arm, POSTURE)
+    law = CartesianImpedance(
+        ImpedanceGains(),
+        lower_rad=arm.lower_rad,
+        upper_rad=arm.upper_rad,
+        effort_nm=np.full(7, 50.0),
+        posture_rad=POSTURE,
+        period_s=0.001,
+    )
+    pulls: list[FloatArray] = []
+    for at in (away, away + turns):
+        here = JointMotion.standing(at)
+        motion, hits = follower.step(here, arm.forward(at), np.zeros(6), 0.004)
+        torque = law._posture_torque(SimpleNamespace(position_rad=at, velocity_rad_s=np.zeros(7)))
+        assert not hits
+        pulls += [motion.velocity_rad_s, torque]
+    assert np.abs(pulls[0]).max() > 1e-3
+    assert pulls[2] == pytest.approx(pulls[0], abs=1e-6)
+    assert pulls[3] == pytest.approx(pulls[1], abs=1e-6)
