@@ -261,8 +261,8 @@ class JointReading:
             joint = int(wrong[0])
             raise CodecError(
                 "invalid",
-                f"{self.arm_joints[joint]} at {values[joint]:.4g} {unit}: more than "
-                f"{BEYOND:g} times what its description allows",
+                f"{self.arm_joints[joint]} at {values[joint]:.4g} {unit}: nothing that an arm of "
+                f"its description can have; it is {most[joint]:.4g} off at most",
             )
 
     def _velocity(self, position: FloatArray, stamp_ns: int) -> FloatArray:
