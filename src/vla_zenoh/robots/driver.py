@@ -205,9 +205,8 @@ class RobotDriver(ABC):
         poses have: of a tool that points down w is about zero, and its sign is that of rounding.
         """
         if isinstance(reference, JointReference):
-            position_rad, *rates = reference
-            position_rad = position_rad - self.turned_rad
-            return JointCommand(self.profile.robot.arm_joints, position_rad, *rates, STREAMING)
+            own = reference._replace(position_rad=reference.position_rad - self.turned_rad)
+            return JointCommand(self.profile.robot.arm_joints, *own, STREAMING)
         position_m, rotation, twist, acceleration = reference
         quat_xyzw = np.array(toward(quat_from_rotation(rotation), self.home_quat))
         return PoseCommand(

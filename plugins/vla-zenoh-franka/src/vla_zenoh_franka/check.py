@@ -263,7 +263,7 @@ def _description(urdf: str, profile: Profile) -> Iterator[HostFinding]:
         file.flush()
         own = Kinematics(Path(file.name), links[0], joints)
     ours, random = make_kinematics(profile), np.random.default_rng(0)
-    middle_rad = sum(ours.sampled_rad) / 2
+    middle_rad = np.mean(ours.sampled_rad, axis=0)
     # (4, 4): our TCP in the frame of the flange.
     tool = np.linalg.inv(flange_pose(middle_rad)) @ _matrix(ours.forward(middle_rad))
     worst = Pose(np.zeros(3), np.eye(3)), Pose(np.zeros(3), np.eye(3))
