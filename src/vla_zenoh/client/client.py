@@ -352,7 +352,7 @@ class Client(StopClient):
         with open_session(profile.session) as session:
             robot = Client(profile, session).subscribe()
             robot.set_prompt("pick up the red brick")
-            robot.activate_with_deadman("my script")
+            robot.activate_with_deadman("my_script")
 
     `expected` has the nodes that the profile assigns to hosts, each with its host; `reception`
     tells what this client does not receive, of its subscriptions by `watch`. `patience_s` is how
