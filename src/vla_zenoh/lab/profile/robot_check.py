@@ -186,7 +186,7 @@ def joints_advice(profile: Profile) -> Iterator[str]:
         endless = ", ".join(compress(kinematics.arm_joints, kinematics.endless))
         yield (
             f"robot.arm_joints: no end, and the shortest way to every target: {endless}. "
-            "robot.joint_range_rad gives them one"
+            "robot.joint_range_rad gives them one, where a cable would wind up"
         )
     yield from _fingers_advice(profile, kinematics.fingers_m)
     where, outside_m = _home_tcp(profile, reach)
