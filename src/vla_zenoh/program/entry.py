@@ -19,6 +19,8 @@ EXTRA_OF = {
 """Module -> extra that brings it, for the error of a missing import."""
 HASTE = -20
 """Niceness of a stop."""
+NO_HOME = "Could not determine home directory"
+"""What pathlib says, as in a container with a user that it does not know."""
 QUIET_OPTIONS = {"--help", "--wait-key"}
 UNHINDERED = ("stop", "up")
 """Commands that an output which cannot be written must not end: a full disk, a reader that left."""
@@ -102,6 +104,8 @@ def _sentence(error: Exception) -> str | None:
 
     if isinstance(error, VlaZenohError):
         return str(error)
+    if isinstance(error, RuntimeError) and str(error).startswith(NO_HOME):
+        return "this user has no home folder: set HOME"
     if not isinstance(error, ImportError):
         return None
     extra = EXTRA_OF.get((error.name or "").partition(".")[0])

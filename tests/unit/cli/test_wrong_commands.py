@@ -251,3 +251,16 @@ def test_a_file_that_is_not_there_is_named_without_numbers_of_the_system(
     assert "Errno" not in done.said
     assert "arm.file" not in done.said
     assert any(word in done.said for word in ("nosuch", "meta/info.json"))
+
+
+@pytest.mark.parametrize(
+    "words", ["up panda_sim", "node command --profile panda_sim", "secure show"]
+)
+def test_a_user_without_a_home_is_told_to_set_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    for name in ("HOME", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    done = typed(capsys, *words.split())
+    assert (done.code, done.said) == (FAILED, "error: this user has no home folder: set HOME")
