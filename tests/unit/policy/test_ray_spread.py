@@ -131,6 +131,26 @@ def test_without_any_replica_it_says_so_instead_of_answering_an_old_observation(
         made(ask, 2).answers([seen("a")])
 
 
+def test_no_replica_that_answers_again_is_asked_for_old_observations(
+    made: Callable[[Answer, int], Spread], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hang, asked = threading.Event(), list[str]()
+
+    def ask(observations: Sequence[Observation], given: Sequence[Any] | None) -> list[ActionSteps]:
+        asked.append(observations[0].robot)
+        hang.wait()
+        return echo(observations, given)
+
+    monkeypatch.setattr(spread, "FIRST_PATIENCE_S", 0.002)
+    replicas = made(ask, 1)
+    for _ in range(8):
+        with pytest.raises(WorkerError, match="no replica"):
+            replicas.answers([seen("old")])
+    hang.set()
+    assert names(replicas.answers([seen("new")])) == ["new"]
+    assert len(asked) - asked.count("new") <= 8, "as many as there are threads"
+
+
 def test_what_the_model_raises_is_not_asked_again(made: Callable[[Answer, int], Spread]) -> None:
     def ask(*_: Any) -> list[ActionSteps]:
         raise ValueError("no such prompt")

@@ -81,21 +81,25 @@ class Spread:
         patience_s, now_s = self.patience_s, time.monotonic()
         give_up_s = now_s + GIVE_UP * patience_s
         pending: dict[Future[list[ActionSteps]], _Part] = {}
-        while left := [part for part in parts if part.found is None]:
-            now_s = time.monotonic()
-            if now_s > give_up_s:
-                raise WorkerError(_silent(left, GIVE_UP * patience_s))
-            for part in left:
-                if now_s >= part.next_s:
-                    pending[self._begin(part, observations, committed)] = part
-                    part.next_s = now_s + patience_s
-            until_s = min(give_up_s, *(part.next_s for part in left))
-            if not pending:  # all of them were lost; `wait` would return at once
-                time.sleep(max(0.0, until_s - now_s))
-                continue
-            done, _ = wait(pending, max(0.0, until_s - now_s), FIRST_COMPLETED)
-            for future in done:
-                self._take(future, pending.pop(future))
+        try:
+            while left := [part for part in parts if part.found is None]:
+                now_s = time.monotonic()
+                if now_s > give_up_s:
+                    raise WorkerError(_silent(left, GIVE_UP * patience_s))
+                for part in left:
+                    if now_s >= part.next_s:
+                        pending[self._begin(part, observations, committed)] = part
+                        part.next_s = now_s + patience_s
+                until_s = min(give_up_s, *(part.next_s for part in left))
+                if not pending:  # all of them were lost; `wait` would return at once
+                    time.sleep(max(0.0, until_s - now_s))
+                    continue
+                done, _ = wait(pending, max(0.0, until_s - now_s), FIRST_COMPLETED)
+                for future in done:
+                    self._take(future, pending.pop(future))
+        finally:
+            for future in pending:  # one that waits for a thread would ask for old observations
+                future.cancel()
         out: dict[int, ActionSteps] = {}
         for part in parts:
             out.update(zip(part.numbers, part.found or (), strict=True))
