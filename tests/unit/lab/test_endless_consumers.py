@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -181,7 +182,8 @@ def test_a_redundant_arm_is_pulled_to_its_posture_as_if_it_had_never_turned(
     for at in (away, away + turns):
         here = JointMotion.standing(at)
         motion, hits = follower.step(here, arm.forward(at), np.zeros(6), 0.004)
-        torque = law._posture_torque(SimpleNamespace(position_rad=at, velocity_rad_s=np.zeros(7)))
+        state: Any = SimpleNamespace(position_rad=at, velocity_rad_s=np.zeros(7))
+        torque = law._posture_torque(state)
         assert not hits
         pulls += [motion.velocity_rad_s, torque]
     assert np.abs(pulls[0]).max() > 1e-3

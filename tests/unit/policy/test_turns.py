@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from vla_zenoh.policy.observation import Streams, assemble
 from vla_zenoh.types import Header, JointState, Stamped, Task
 
 TURN = 2 * math.pi
+Turns = Literal["wrapped", "counted"]
 NAMES = ("lift", "wrist")
 NOW_NS = 10**18
 STILL = np.zeros(2)
@@ -33,7 +34,7 @@ def state(wrist_rad: float, lift_rad: float = 7.0) -> JointState:
     return JointState(NAMES, at, STILL, None, at, endless=("wrist",))
 
 
-def model(turns: str, history: int = 1) -> ModelSpec:
+def model(turns: Turns, history: int = 1) -> ModelSpec:
     action = ActionSpec(
         horizon=4,
         dt_s=0.1,
@@ -62,7 +63,7 @@ def observed(spec: ModelSpec, *wrist_rad: float) -> Observation:
 
 @pytest.mark.parametrize(("turns", "told"), [("wrapped", 3.5 - TURN), ("counted", 3.5 + 6 * TURN)])
 def test_an_observation_has_the_declared_form_and_so_has_its_history(
-    turns: str, told: float
+    turns: Turns, told: float
 ) -> None:
     found = observed(model(turns, 2), 3.4 + 6 * TURN, 3.5 + 6 * TURN)
     assert found.joint is not None
@@ -129,7 +130,7 @@ def test_an_arm_that_crosses_half_a_turn_has_not_moved_far() -> None:
 
 
 @pytest.mark.parametrize("turns", ["wrapped", "counted"])
-def test_data_sets_and_servers_have_the_declared_form(tmp_path: Path, turns: str) -> None:
+def test_data_sets_and_servers_have_the_declared_form(tmp_path: Path, turns: Turns) -> None:
     profile = endless_arm(tmp_path)
     names, still = profile.robot.arm_joints, np.zeros(6)
     at = np.array([0.0, 2.0, 2.0, 0.0, 2.0, 20.0])
