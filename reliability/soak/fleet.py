@@ -48,8 +48,7 @@ from two_robots import BOUNCE, write_bouncer
 from vla_zenoh.bus.buffers import header_of
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 
-HZ, RATE_HZ = 25, 2.5
-"""Of arms and command nodes, so that eight robots fit two cores; and of each worker."""
+HZ, RATE_HZ = 50, 2.5
 HORIZON, DT_S = 10, 0.1
 GOOD, SHADES = "good", ("shade", "shade2")
 COMMAND_S, STATE_S = 1.0, 2.0
