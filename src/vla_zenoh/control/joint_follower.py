@@ -387,13 +387,14 @@ class JointFollower:
         tick, most = self.jerk_rad_s3 * dt_s, self.acceleration_rad_s2
         least = np.maximum(np.minimum(before - tick, most), -most)
         greatest = np.minimum(np.maximum(before + tick, -most), most)
-        top, limit = [], self.velocity_rad_s
+        top, limit, ramp_s = [], self.velocity_rad_s, most / self.jerk_rad_s3
         for sign, bound in ((1.0, self.upper_rad), (-1.0, self.lower_rad)):
             room = limit - sign * velocity
             high = np.where(room >= 0, self._rampable(np.maximum(room, 0.0), dt_s), room / dt_s)
             left = sign * (bound - joints)
-            fastest = np.maximum(sign * velocity, 0.0) + most * dt_s
-            near = left < fastest * (dt_s + most / self.jerk_rad_s3 + fastest / (2 * most))
+            # A joint gets faster until the jerk has ended its acceleration.
+            fastest = np.maximum(sign * velocity, 0.0) + most * (dt_s + ramp_s)
+            near = left < fastest * (dt_s + ramp_s + fastest / (2 * most))
             for joint in np.flatnonzero(near):
                 end = _towards_end(
                     float(left[joint]),

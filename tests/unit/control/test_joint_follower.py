@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.joint_follower import DistanceConstraints, JointFollower
+from vla_zenoh.control.joint_follower import DistanceConstraints, JointFollower, JointMotion
 from vla_zenoh.control.limits import into_workspace, joint_motion_limits, motion_limits
 from vla_zenoh.control.pose_to_joint import FAR, LAG_M, LAG_RAD, PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
@@ -264,6 +264,20 @@ def test_a_face_of_the_box_is_told_as_the_workspace_whatever_else_is_near() -> N
     constraints = DistanceConstraints(BASE.limits, ReachabilityFilter(BASE, KINEMATICS).barriers)
     constraints.update(HOME_RAD)
     assert [constraints.hit(face, 0.001).name for face in range(6)] == ["workspace"] * 6
+
+
+def test_a_joint_that_brakes_gently_stops_before_its_end() -> None:
+    """Which takes it more than a second and half of its range."""
+    follower = JointFollower(KINEMATICS, HOME_RAD, acceleration_rad_s2=0.5, jerk_rad_s3=5.0)
+    still, ahead_rad = np.zeros(7), np.eye(7)[6]
+    start_rad = np.where(ahead_rad, follower.lower_rad, HOME_RAD)
+    motion, fastest_rad_s = JointMotion(start_rad, still, still, still), 0.0
+    for _ in range(400):
+        here, jacobian = KINEMATICS.pose_and_jacobian(motion.position_rad)
+        motion, _ = follower.step(motion, here, jacobian @ (2.0 * ahead_rad), 0.02)
+        fastest_rad_s = max(fastest_rad_s, motion.velocity_rad_s[6])
+    assert fastest_rad_s > 1.2
+    assert follower.upper_rad[6] - 0.05 < motion.position_rad[6] <= follower.upper_rad[6] + RTOL
 
 
 def test_slopes_of_distances_are_those_of_small_steps() -> None:
