@@ -360,7 +360,7 @@ class ReferenceGovernor(Generic[Reference]):
         if self._time_s >= self._trajectory.duration * UNIT_S:
             if self._stopping:
                 self.put(self._space.beside(self.target, self._way))
-            self._way, self._planned, self._cramped = None, False, None
+            self._way = self._cramped = None
 
     def _settle(self, way: GovernedPath, taken: FloatArray) -> None:
         """Plan the difference to zero, beside a path that takes these shares (3, n)."""

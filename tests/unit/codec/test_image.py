@@ -106,6 +106,11 @@ def test_padding_behind_the_end_of_a_jpeg_is_read() -> None:
     assert image.decode_jpeg(JPEG + bytes(7)).rgb.shape == SMOOTH.rgb.shape
 
 
+def test_a_long_comment_before_the_picture_is_passed_over() -> None:
+    comment = b"\xff\xfe" + (1002).to_bytes(2, "big") + bytes(1000)
+    assert image.decode_jpeg(JPEG[:2] + comment + JPEG[2:]).rgb.shape == SMOOTH.rgb.shape
+
+
 def frame_header(height: int, width: int) -> bytes:
     numbers = height.to_bytes(2, "big") + width.to_bytes(2, "big")
     return b"\xff\xc0\x00\x11\x08" + numbers + b"\x03\x01\x22\x00\x02\x11\x01\x03\x11\x01"

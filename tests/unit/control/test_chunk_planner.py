@@ -401,6 +401,10 @@ def test_what_slowed_a_step_lasts_until_the_arm_is_through_with_it() -> None:
     assert then is not None
     assert (then.name, then.share, then.late_s) == ("joint_velocity", 0.5, pytest.approx(0.05))
     assert keep_slowdown(then, None, 0.1, 0.3) is None
+    near = Slowdown("table_distance", 0.5, 0.1, 0.2, "hand")  # the arm is not late
+    assert keep_slowdown(near, None, 0.1, 0.3) is None
+    faster = slow._replace(share=0.8)
+    assert keep_slowdown(near, faster, 0.1, 0.3) is faster
     twice = keep_slowdown(slow, slow._replace(share=0.8), 0.1, 0.3)
     assert twice is not None
     assert (twice.share, twice.late_s) == (0.5, pytest.approx(0.3))

@@ -9,6 +9,7 @@ import pytest
 from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
+from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.joint_space import STEP_HALVINGS, JointBounds, JointPath
 from vla_zenoh.control.limits import (
     PAUSE_LEAD_RAD,
@@ -17,9 +18,10 @@ from vla_zenoh.control.limits import (
     Slowdown,
     workspace_corners,
 )
-from vla_zenoh.control.plan_timeline import joint_goal
+from vla_zenoh.control.plan_timeline import JointGoal, joint_goal
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.types import FloatArray
+from vla_zenoh.control.step_space import JointSteps
+from vla_zenoh.types import FloatArray, Header, JointState, Stamped
 
 BOX = workspace_corners(panda().limits)
 OUTSIDE_M = 1e-4
@@ -268,3 +270,39 @@ def test_a_step_into_a_barrier_is_cut_where_it_is_forbidden_and_not_dropped(
     assert 0.05 < share < 1.0
     assert not bounded(0.99 * share).hits
     assert bounded(share + 2.0**-STEP_HALVINGS).hits
+
+
+def test_between_two_measurements_joints_are_where_they_were_by_then() -> None:
+    profile, states, ms = panda(), StateHistory[JointState](), 1_000_000
+    reach = ReachabilityFilter(profile)
+    bounds = JointBounds(profile, reach.kinematics, reach.barriers)
+    for at_ns, turned_rad in ((10**18, 0.0), (10**18 + 8 * ms, 0.2)):
+        still = np.zeros(len(HOME_RAD))
+        record = JointState(reach.kinematics.arm_joints, HOME_RAD + turned_rad, still, still)
+        states.add(Stamped(Header(at_ns, 1, "arm"), record, at_ns))
+    found = JointSteps(bounds, reach, states, 100 * ms).measured(10**18 + 2 * ms, 0.0)
+    assert isinstance(found, JointGoal)
+    np.testing.assert_allclose(found.joints_rad, HOME_RAD + 0.05)
+
+
+def test_the_length_of_a_motion_is_no_less_than_the_curve_of_its_tcp() -> None:
+    path = made_path()
+    profile, arm = panda(), path.kinematics
+    bounds = JointBounds(profile, arm, ReachabilityFilter(profile).barriers)
+    way_rad = np.array([0.0, -0.9, 0.0, 0.9, 0.0, 0.0, 0.0])
+    places_m = [arm.forward(HOME_RAD + t * way_rad).position_m for t in np.linspace(0, 1, 200)]
+    curve_m = float(np.linalg.norm(np.diff(places_m, axis=0), axis=1).sum())
+    assert curve_m <= bounds.ways(HOME_RAD, way_rad)[0] < 1.5 * curve_m
+
+
+def test_an_approach_in_joints_takes_no_more_than_a_step_at_a_time() -> None:
+    """In a step of 0.2 s its speed alone would allow 0.3 rad."""
+    arm = Joints(panda(limits={"approach_rad_s": 1.5}), dt_s=0.2)
+    arm.activate()
+    goal_rad = arm.home_rad + np.eye(7)[6]
+    arm.send(*[arm.columns(goal_rad)] * 4)
+    arm.run(0.04)
+    timeline = arm.rig.commander.parts[0].motion.timeline
+    assert timeline is not None
+    turned_rad = np.diff([goal.joints_rad[6] for goal in timeline.plan.goals])
+    assert turned_rad.max() == pytest.approx(arm.profile.limits.step_rad)

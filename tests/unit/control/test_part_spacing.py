@@ -21,6 +21,8 @@ LEAN = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 0.0, 0.0])
 """From home towards the other arm."""
 AT_STOP, STEP = 1.55, 0.01
 """Multiples of that: where the arms are at their stop, and how they come nearer."""
+LATE_NS = 1_000_000
+"""A look comes with a tick, that is later than a period after the one before."""
 
 
 @cache
@@ -53,9 +55,24 @@ class Arms:
         for number in range(8):
             for part in self.parts:
                 part.measured_rad = leaning(AT_STOP + STEP * number)
-            hit = self.spacing.monitor(since_ns + number * PERIOD_NS)
+            hit = self.spacing.monitor(since_ns + number * (PERIOD_NS + LATE_NS))
             found += [] if hit is None else [hit.name]
         return found
+
+    def stand(self, share: float, ahead: float | None = None) -> tuple[float, bool]:
+        """Share of the speed of arms that lean so far and are to lean as far as `ahead`.
+
+        And whether they are stopped.
+        """
+        end = leaning(share if ahead is None else ahead)
+        for part in self.parts:
+            part.motion = SimpleNamespace(
+                joints_rad=leaning(share),
+                stopping_rad=lambda _: [end],
+                wanted_rad=lambda _: leaning(2.0),
+            )
+        slowdown, hit = self.spacing.look(NOON_NS, 0.004, moves=True)
+        return 1.0 if slowdown is None else slowdown.share, hit is not None
 
 
 @pytest.mark.parametrize("set_by_ns", [0, HOUR_NS, -HOUR_NS], ids=["kept", "forward", "back"])
@@ -94,3 +111,15 @@ def test_arms_stand_before_their_stop_however_slowly_they_come_nearer(share_s: f
         _, hit = arms.spacing.look(NOON_NS + number, tick_s, moves=True)
         share += 0.0 if hit else tick_s * share_s
     assert arms.spacing.nearest.distance_m > pair().limits.reach.part_stop_m
+
+
+def test_arms_near_each_other_are_slow_while_they_come_nearer_and_not_as_they_part() -> None:
+    """From 0.14 m apart, which is far enough, to 0.08 m and back; their stop is at 0.03 m."""
+    arms = Arms()
+    on_their_way = [arms.stand(share)[0] for share in (1.2, 1.3, 1.4, 1.3, 1.4, 1.2)]
+    assert on_their_way == pytest.approx([1.0, 0.95, 0.75, 1.0, 0.75, 1.0])
+
+
+def test_arms_that_begin_too_near_to_each_other_may_move_apart_and_no_nearer() -> None:
+    assert not Arms().stand(1.57, ahead=1.56)[1]
+    assert Arms().stand(1.57, ahead=1.58)[1]

@@ -528,6 +528,15 @@ def test_a_step_that_starts_elsewhere_is_judged_from_there() -> None:
     assert_sane(shadow, pose)
 
 
+def test_a_step_that_starts_at_the_same_place_turned_is_judged_from_there() -> None:
+    """Joints of 0.1 rad/s would need 2 s from how the shadow stands to how the step starts."""
+    own = Limits.model_validate({"joint": {"velocity_rad_s": 0.1}})
+    shadow = shadow_at(MIDDLE_RAD, own, command="joint")
+    turned = moved(KINEMATICS.forward(MIDDLE_RAD), STILL, 0.2 * YAW)
+    found = bounded(shadow, turned, turned, dt_s=0.1)
+    assert (found.hits, found.slowdown) == ([], None)
+
+
 def test_after_a_reset_the_shadow_stands_where_the_robot_is() -> None:
     shadow = at(MIDDLE_RAD)
     walk(shadow, STEP_M * UP, STILL, 20)

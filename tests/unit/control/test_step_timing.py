@@ -12,8 +12,12 @@ import numpy as np
 import pytest
 from command_rig import MS, Rig, profile
 
-from vla_zenoh.kinematics.so3 import norm3
+from vla_zenoh.control.limits import motion_limits
+from vla_zenoh.control.plan_timeline import Goal, Plan
+from vla_zenoh.control.step_timing import Arrivals, StepTiming
+from vla_zenoh.kinematics.so3 import Pose, norm3
 from vla_zenoh.policy.plan_clock import idle_time
+from vla_zenoh.types import Cause
 
 RIPPLE = 0.3
 """(max - min) / mean of the commanded speed over the middle of the way; of a model that cannot
@@ -247,3 +251,26 @@ def test_at_speed_zero_the_arm_stands_and_stays_active_and_goes_on_to_the_same_g
     rig.run(2.0)
     np.testing.assert_allclose(rig.position_m - begun_m, [0.2, 0.0, 0.0], atol=AT_GOAL_M)
     rig.assert_smooth()
+
+
+def test_of_chunks_that_come_evenly_the_next_is_expected_a_period_later_and_hardly_any_spared() -> (
+    None
+):
+    arrivals = Arrivals()
+    for number in range(60):
+        due_ns, spare_ns = arrivals.arrived(number * 100 * MS, 150 * MS)
+    assert due_ns == pytest.approx(60 * 100 * MS, abs=MS)
+    assert 0 <= spare_ns < MS
+
+
+def test_an_arm_that_chunks_reach_evenly_does_not_get_slower_and_slower() -> None:
+    timing = StepTiming(motion_limits(profile().limits).box)
+    goal = Goal(Pose(np.zeros(3), np.eye(3)), 0.0)
+    cause = Cause("scripted", 0, 0, 0, 0, 0, 0, 0)
+    way, shares = np.array([0.01, 0, 0, 0, 0, 0]), list[float]()
+    for number in range(60):
+        now_ns = 10**18 + number * 100 * MS
+        plan = Plan(now_ns, now_ns, 50 * MS, [goal] * 4, cause)
+        shares.append(timing.share(plan, 0, now_ns, 0.1, 10.0, way, np.zeros(6)))
+    assert min(shares[20:]) > 0.999 * max(shares[20:])
+    assert max(shares[20:]) < 1.0

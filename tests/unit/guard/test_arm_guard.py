@@ -253,6 +253,16 @@ def test_a_stream_of_one_that_brakes_already_need_not_be_told() -> None:
     assert not side.guard.unheeded
 
 
+def test_a_command_that_comes_again_after_its_stream_ended_need_not_be_told() -> None:
+    side = Side()
+    assert side.pose() is None
+    side.tick(SILENT_MS)
+    side.seq = 0
+    assert side.pose() == "replayed"
+    side.tick()
+    assert not side.guard.unheeded
+
+
 def test_after_a_clock_was_set_back_it_is_not_unheeded_for_ever() -> None:
     side = Side()
     assert side.pose(0.1) == "jump"

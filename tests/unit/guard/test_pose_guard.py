@@ -412,3 +412,18 @@ def test_the_robots_own_stop_may_be_twice_as_hard_as_the_stream() -> None:
     limits = pose_brake_limits(profile)
     assert limits.translation == (1.0, 4.0, 40.0)
     assert limits.rotation == (3.0, 12.0, 120.0)
+
+
+@pytest.mark.parametrize("every_ms", [1, 2, 5])
+def test_a_stop_takes_as_long_whatever_the_period_of_the_controller(every_ms: int) -> None:
+    """From 0.5 m/s, with 4 m/s^2 and 40 m/s^3: 0.225 s."""
+    side, line = guard(), Line(0.5)
+    for t in range(0, 600, every_ms):
+        if t % 10 == 0:
+            assert side.offer(line.at(t * MS), now(t * MS)) is None
+        side.tick(now(t * MS), every_ms * 1e-3)
+    side.stop()
+    while side.moving:
+        t += every_ms
+        side.tick(now(t * MS), every_ms * 1e-3)
+    assert t - 600 == pytest.approx(225, abs=12)

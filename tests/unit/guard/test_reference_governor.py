@@ -18,7 +18,7 @@ from vla_zenoh.guard.reference_governor import (
     PoseSpace,
     ReferenceGovernor,
 )
-from vla_zenoh.guard.stream_guard import PoseGuard
+from vla_zenoh.guard.stream_guard import ACCELERATE_S, Extrapolation, PoseGuard
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3
 from vla_zenoh.types import FloatArray, Header, JointReference, PoseCommand, Stamped
 
@@ -67,8 +67,8 @@ def test_steps_of_any_size_are_joined_within_the_limits_and_made_up_for_wholly(
         assert np.abs(differences).max() <= BRAKE_MARGIN * limit * (1 + RTOL)
 
 
-def test_twenty_millimetres_are_gone_soon_and_a_tenth_of_one_sooner() -> None:
-    for step, after_s in ((0.02, SOON_S), (1e-4, SOON_S / 3)):
+def test_fifty_millimetres_are_gone_soon_and_a_tenth_of_one_sooner() -> None:
+    for step, after_s in ((0.05, 0.45), (0.02, SOON_S), (1e-4, SOON_S / 3)):
         path = led(governor(), standing(step), round(SOON_S / DT_S))
         np.testing.assert_array_equal(path[round(after_s / DT_S) :], step)
 
@@ -216,3 +216,23 @@ def test_a_stream_that_stood_still_for_a_moment_does_not_pull_the_reference_back
     steps = np.diff(positions)[150:]
     assert float(np.abs(steps - SPEED_M_S * DT_S).max()) < STEP_SLACK_M
     assert abs(positions[-1] - (start.position_m[0] + way_m)) < 2 * SPEED_M_S * 0.004
+
+
+def test_it_moves_as_long_as_one_axis_of_its_path_does() -> None:
+    side, still = governor(2), np.zeros(2)
+    change, rate = OWN[2] * DT_S, OWN[2] * DT_S**2 / 2
+    told = JointReference(*np.outer([rate * DT_S / 3, rate, change], [1.0, 0.0]))
+    side.follow(told, steady=False)
+    assert side.motion is told
+    assert side.moving
+    side.put(JointReference(told.position_rad, still, still))
+    assert not side.moving
+
+
+def test_the_acceleration_of_a_command_goes_on_for_a_while_if_the_next_is_lost() -> None:
+    axis = np.ones(1)
+    brake = GovernorLimits(*(np.array([limit]) for limit in BRAKE_MARGIN * OWN), axis, axis)
+    told = JointReference(np.zeros(1), 0.1 * axis, axis)
+    later = Extrapolation(JointSpace(), told, None, 0.0, brake).at(ACCELERATE_S)
+    assert later.velocity_rad_s[0] == pytest.approx(0.1 + ACCELERATE_S)
+    assert later.position_rad[0] == pytest.approx(0.1 * ACCELERATE_S + ACCELERATE_S**2 / 2)

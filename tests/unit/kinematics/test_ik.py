@@ -48,6 +48,13 @@ def several_near_an_end(found_rad: FloatArray, joints_rad: FloatArray) -> bool:
     return int((low | high).sum()) >= 2
 
 
+def test_a_pose_that_is_further_away_takes_more_effort() -> None:
+    here = KINEMATICS.forward(HOME_RAD)
+    near, far = (moved(here, np.array([0.0, way_m, 0.0]), np.zeros(3)) for way_m in (0.001, 0.2))
+    efforts = [SOLVER.approach(pose, HOME_RAD, bounded=False).effort for pose in (here, near, far)]
+    assert 0 <= efforts[0] < efforts[1] < efforts[2]
+
+
 # -- one pose ---------------------------------------------------------------------------------
 @given(INNER_SHARES, OFFSETS)
 @example([0.5, 0.03125, 0.3125, 0.125, 0.25, 0.03125, 0.5], [0.0, 0.0, 0.0, 0.0, 0.25, 0.0, 0.25])
