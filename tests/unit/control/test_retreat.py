@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_rig import START_M, Rig
+from command_rig import MS, START_M, Rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.commander_io import Setting
+from vla_zenoh.control.commander_io import NewStates, Setting
 from vla_zenoh.control.contact import RELIEF_M, SPACE_M, CommandTrail
 from vla_zenoh.control.preflight import state_lost
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.types import PoseState, Stamped
+from vla_zenoh.types import Header, PoseState, Stamped
 
 STIFFNESS_N_M = 2000.0
 QUIET_N = 3.0
@@ -476,6 +476,21 @@ def test_a_single_false_pose_of_an_arm_without_kinematics_is_forgotten_when_it_i
     rig.position_m = here_m
     rig.tick()
     assert not states.doubt
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(0.75, False), (1.25, True)])
+def test_an_arm_that_is_pushed_is_no_false_pose_unless_nobody_pushes_so_fast(
+    share: float, doubted: bool
+) -> None:
+    """Of 4 times the speed of a command, for a fifth of a second without a pose."""
+    rig = Rig()
+    states, now_ns = rig.commander.parts[0].states, rig.now_ns
+    pushed_m = share * 0.2 * 4 * rig.profile.limits.translation.velocity_m_s
+    for x_m, at_ns in ((0.0, now_ns), (pushed_m, now_ns + 200 * MS)):
+        pose = rig.pose_state().record
+        moved = replace(pose, position_m=pose.position_m + [x_m, 0.0, 0.0])
+        states.update(NewStates(pose=Stamped(Header(at_ns, 1, "arm"), moved, at_ns)))
+    assert bool(states.doubt) is doubted
 
 
 def test_a_pose_that_jumped_and_stays_there_is_not_trusted_without_kinematics() -> None:
