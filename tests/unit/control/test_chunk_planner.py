@@ -393,6 +393,14 @@ def test_a_target_for_which_the_joints_are_too_slow_is_reached_slower() -> None:
         joints.append(slow._solver.approach(pose, joints[-1], bounded=False).joints_rad)
     speed = np.abs(np.diff(joints, axis=0)).max() * rig.profile.timing.command_hz
     assert speed < 0.3 * 1.25  # of a straight step whose middle needs more than its mean
+    # Told again when it is activated again, though not at every step.
+    rig.put("active", False)
+    rig.settle()
+    rig.send([[*rig.position_m, *DOWN]])
+    rig.put("active", True)
+    rig.events.clear()
+    go(rig, [*(target_m - [0.0, 0.14, 0.0]), *DOWN], 5.0)
+    assert [event.what for event in rig.events].count("joint_velocity") == 1
 
 
 def test_what_slowed_a_step_lasts_until_the_arm_is_through_with_it() -> None:
