@@ -357,11 +357,9 @@ class JointFollower:
             return 1.0
         ahead = joints + wanted * (SINGULARITY_PEEK_RAD / fastest)
         after = smallest_singular_value(self.kinematics.jacobian(ahead))
-        # At the speed within the limits, or the rate would be that of an impossible velocity.
-        share = 1.0 / max(1.0, float(np.max(np.abs(wanted) / self.velocity_rad_s)))
-        fall_1_s = (singular_value - after) / SINGULARITY_PEEK_RAD * fastest * share
+        fall_1_s = (singular_value - after) / SINGULARITY_PEEK_RAD * fastest
         allowed = SINGULARITY_1_S * max(singular_value - self._singularity_stop, 0.0)
-        return share * allowed / fall_1_s if fall_1_s > allowed else 1.0
+        return allowed / fall_1_s if fall_1_s > allowed else 1.0
 
     def _reachable(self, wanted: FloatArray, now: JointMotion, dt_s: float) -> FloatArray:
         """Velocity (n,) after one tick towards `wanted`, without overshoot later."""
