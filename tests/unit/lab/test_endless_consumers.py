@@ -6,6 +6,7 @@ Numpy's warnings are errors here: an infinite range that becomes no number fails
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -139,23 +140,29 @@ def test_joints_after_many_turns_conform(profile: Profile) -> None:
     assert all(finding.right for finding in findings), findings
 
 
-def test_units_from_end_to_end_need_ends(profile: Profile) -> None:
-    options = LeRobotOptions(robot="any", port="/dev/null", id="one", units="normalised")
-    without = override(profile, {"robot": {"gripper": None}})
-    with pytest.raises(NodeError, match="joint1, joint4, joint6 turns without an end"):
-        LeRobotArm(without, options.model_copy(update={"gripper": ""}))
+def lerobot_arm(profile: Profile, units: str) -> LeRobotArm:
+    given = {"robot": "any", "port": "/dev/null", "id": "one", "gripper": "", "units": units}
+    return LeRobotArm(profile, LeRobotOptions.model_validate(given))
+
+
+def physicalai_layout(profile: Profile, unit: str) -> Layout:
     names = profile.robot.arm_joints
-    with pytest.raises(NodeError, match="joint1, joint4, joint6 turns without end"):
-        Layout(
-            without,
-            names,
-            joints=names,
-            gripper="",
-            gripper_ends=(0.0, 1.0),
-            unit="normalised",
-            zero=(),
-            reversed=(),
-        )
+    ends = {"gripper": "", "gripper_ends": (0.0, 1.0), "zero": (), "reversed": ()}
+    return Layout(profile, names, joints=names, unit=unit, **ends)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("make", [lerobot_arm, physicalai_layout])
+def test_units_from_end_to_end_need_ends_and_degrees_need_a_turn(
+    make: Callable[[Profile, str], object], profile: Profile, tmp_path: Path
+) -> None:
+    without = override(profile, {"robot": {"gripper": None}})
+    with pytest.raises(NodeError, match="joint1, joint4, joint6 turns without"):
+        make(without, "normalised")
+    make(without, "degrees")
+    lift = made_arm(tmp_path, "sztytz")
+    with pytest.raises(NodeError, match="joint1 slides"):
+        make(lift, "degrees")
+    make(lift, "normalised")
 
 
 SEVEN = "eztyeztytzexty"

@@ -49,12 +49,17 @@ class LeRobotArm:
             profile.robot.require_gripper(f"lerobot.gripper {settings.gripper!r}")
         self._width_m = profile.robot.max_width_m
         sign = np.array([-1.0 if name in settings.reversed else 1.0 for name in names])
+        kinematics = make_kinematics(profile)
+        order = [kinematics.arm_joints.index(name) for name in names]
         if settings.units == "degrees":
+            if slides := list(itertools.compress(names, kinematics.slides[order])):
+                raise NodeError(
+                    f"{', '.join(slides)} slides, and degrees are of joints that turn; set "
+                    "lerobot.units: normalised"
+                )
             self._zero = np.array(settings.zero_deg or (0.0,) * len(names))
             self._unit_rad = sign * np.pi / 180
         else:
-            kinematics = make_kinematics(profile)
-            order = [kinematics.arm_joints.index(name) for name in names]
             lower, upper = kinematics.lower_rad[order], kinematics.upper_rad[order]
             if endless := list(itertools.compress(names, kinematics.endless[order])):
                 raise NodeError(

@@ -70,9 +70,12 @@ class Layout:
         ours = profile.robot.arm_joints
         sign = np.array([-1.0 if name in reversed else 1.0 for name in ours])
         self._zero = np.array(zero or (0.0,) * len(ours))
+        kinematics = make_kinematics(profile)
+        order = [kinematics.arm_joints.index(name) for name in ours]
+        slides = list(itertools.compress(ours, kinematics.slides[order]))
+        if slides and unit == "degrees":
+            raise NodeError(f"unit degrees, but {', '.join(slides)} slides: declare normalised")
         if unit == "normalised":
-            kinematics = make_kinematics(profile)
-            order = [kinematics.arm_joints.index(name) for name in ours]
             lower_rad, upper_rad = kinematics.lower_rad[order], kinematics.upper_rad[order]
             endless = list(itertools.compress(ours, kinematics.endless[order]))
             if len(zero):
