@@ -98,7 +98,12 @@ def joint_commands(loop: Lockstep) -> list[JointCommand]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "turns"), [("delta", "wrapped"), ("absolute", "wrapped"), ("absolute", "counted")]
+    ("kind", "turns"),
+    [
+        pytest.param("delta", "wrapped", marks=pytest.mark.slow),
+        ("absolute", "wrapped"),
+        pytest.param("absolute", "counted", marks=pytest.mark.slow),
+    ],
 )
 def test_ten_turns_of_the_wrist_are_made_without_a_jump(
     tmp_path: Path, kind: str, turns: str
