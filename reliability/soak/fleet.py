@@ -41,7 +41,7 @@ import numpy as np
 import zenoh
 from camera_rig import free_endpoint, until
 from chain import Chain, running_chain
-from ledger import Ledger, segments
+from ledger import FRONT_OF_RAY, Ledger, segments
 from ray_rig import VARIABLE, ray_worker, replicas
 from two_robots import BOUNCE, write_bouncer
 
@@ -433,7 +433,7 @@ def main() -> int:
             robots[file.stem] = stack.enter_context(chain)
             if with_ray and not front:  # before the others: Ray gives up on a busy computer
                 pid = stack.enter_context(ray_worker(folder, file, SHADES[1]))
-                front[f"{SHADES[1]} in front of its replicas"] = pid
+                front[f"{SHADES[1]} {FRONT_OF_RAY}"] = pid
                 until("both replicas", lambda: len(replicas(folder)) == REPLICAS, READY_S)
         gpu = stack.enter_context(running_chain(folder, profile_file=files[0], host="gpu"))
         fleet = Fleet(folder, robots, gpu, found, front)

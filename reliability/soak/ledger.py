@@ -24,6 +24,9 @@ up, and end it when it had nothing to do for 10 s: 13 more were the most that wa
 ROUTER_MIB = 24.0
 """One that was started anew takes 12 MiB once, when it has heard junk, and 2 for each camera that
 dies; the other nodes gained 7.6 at most in an hour."""
+FRONT_OF_RAY, RAY_MIB = "in front of its replicas", 64.0
+"""A worker that asks replicas of Ray Serve: what Ray keeps of requests goes up and down with them,
+see docs/explanation/reliability.md."""
 CALM_MIB = 8.0
 """And so much in the calm at the end, in which nothing dies."""
 LINKS_SETTLE_S = 20.0
@@ -63,6 +66,8 @@ class Growth(NamedTuple):
 
     @property
     def _most_mib(self) -> float:
+        if self.node.endswith(FRONT_OF_RAY):
+            return RAY_MIB
         if self.calm:
             return CALM_MIB
         return ROUTER_MIB if self.node.startswith("router") else GROWTH_MIB

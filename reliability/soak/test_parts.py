@@ -11,8 +11,10 @@ from collections import Counter
 import pytest
 from ledger import (
     CALM_MIB,
+    FRONT_OF_RAY,
     GROWTH_HANDLES,
     GROWTH_MIB,
+    RAY_MIB,
     ROUTER_MIB,
     Growth,
     Held,
@@ -122,6 +124,16 @@ def test_only_a_router_may_take_what_it_takes_once() -> None:
     assert Growth("router", 1, 60.0, first, more).leaks == []
     assert Growth("router", 1, 60.0, first, more._replace(heap_mib=more.heap_mib + 1)).leaks != []
     assert Growth("sim", 1, 60.0, first, more).leaks != []
+
+
+def test_a_worker_in_front_of_ray_may_take_what_ray_keeps_of_requests() -> None:
+    first = Held(20.0, 100.0, 90.0, 80.0, 30, 20)
+    more = first._replace(heap_mib=80.0 + RAY_MIB)
+    for calm in (False, True):
+        assert Growth(f"shade {FRONT_OF_RAY}", 1, 60.0, first, more, calm).leaks == []
+        assert Growth("shade", 1, 60.0, first, more, calm).leaks != []
+    beyond = more._replace(heap_mib=more.heap_mib + 1)
+    assert Growth(f"shade {FRONT_OF_RAY}", 1, 60.0, first, beyond).leaks != []
 
 
 def test_what_this_process_holds_is_seen() -> None:
