@@ -58,6 +58,8 @@ def tf_lab(
         patience_s=LONG_PATIENCE_S,
     ) as lab:
         lab.chain.activate_when_ready()
+        lab.person.ask("hear", "hears", topic="/tf", type=TF_MESSAGE)
+        lab.person.ask("hear", "hears", topic="/tf_static", type=TF_MESSAGE, qos_of=LATE)
         yield lab
 
 
@@ -80,8 +82,6 @@ def test_rclpy_sees_the_links_and_the_set_point_where_the_robots_joints_are(
     """tf2's rules: composed upwards from the last link they give the pose of the forward map."""
     lab, person = tf_lab, tf_lab.person
     lab.settle()
-    person.ask("hear", "hears", topic="/tf", type=TF_MESSAGE)
-    person.ask("hear", "hears", topic="/tf_static", type=TF_MESSAGE, qos_of=LATE)
     detail = lab.chain.until("links", lambda: LINKS[0] in tf(lab)["published"] and tf(lab))
     assert {*LINKS, "panda_hand"} <= set(detail["published"])
     lab.arm.wait_still()
