@@ -89,8 +89,9 @@ def test_the_robots_own_node_is_killed_and_comes_back_elsewhere(ros_lab: RosLab)
 
     The bridge's DDS writer keeps the newest pose for the node that died, until its lease ends, and
     Fast DDS asks for it where the subscription is reliable, as here: one old pose reaches the new
-    node, and that is reported (docs/how-to/ros2.md). Ours to stay where it is follows the first
-    joint state, and no other; bench_rclpy.py measures how soon, and how far the arm went.
+    node, and that is reported (docs/how-to/ros2.md). Ours to stay where it is follow the first
+    joint states, and none to another place; bench_rclpy.py measures how soon, and how far the arm
+    went.
     """
     ros_lab.move()
     time.sleep(0.2)
@@ -101,7 +102,8 @@ def test_the_robots_own_node_is_killed_and_comes_back_elsewhere(ros_lab: RosLab)
     time.sleep(2.0)
     stood = ros_lab.arm.wait_still()
     goals = ros_lab.arm.since(told, "goal")
-    assert 1 <= len(goals) <= 2, goals
+    away_m = np.linalg.norm([goal["goal"] - stood[:3, 3] for goal in goals], axis=1)
+    assert (away_m > EXACT_M).sum() <= 1, goals
     assert goals[-1]["stamp_ns"] > before_ns, ros_lab.story()
     assert stood[:3, 3] == pytest.approx(goals[-1]["goal"], abs=EXACT_M)
     came_m = np.linalg.norm(stood[:3, 3] - panda_dh.forward(np.array(panda_dh.HOME_RAD))[:3, 3])
