@@ -225,4 +225,5 @@ def _report(file: Path, arm: Arm, drive: Drive, notes: list[str], as_json: bool)
         out.print(styled("guess", "yellow"), f"{guess.place}: {guess.what}", soft_wrap=True)
     out.print(f"simulate it: vla-zenoh up {file} --sim", soft_wrap=True)
     if drive.ros2:
-        out.print(f"drive it, once nothing is unconfirmed: vla-zenoh up {file}", soft_wrap=True)
+        begin = f"vla-zenoh up {file} --dry-run, then without --dry-run"
+        out.print(f"drive it, once nothing is unconfirmed: {begin}", soft_wrap=True)
