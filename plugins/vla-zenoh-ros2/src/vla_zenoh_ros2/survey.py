@@ -118,7 +118,7 @@ def survey(
         raise SessionError(
             f"no Zenoh router answers at {where}: start zenoh-bridge-ros2dds on the robot's "
             "computer (or, where the robot runs rmw_zenoh, its router: ros2 run rmw_zenoh_cpp "
-            "rmw_zenohd), and check the address (--connect tcp/ROBOT:7447), port and firewall"
+            "rmw_zenohd), and check its address, --connect tcp/ROBOT:7447, port and firewall"
         ) from error
     with opened:
         return _Look(opened, where, timeout_s, tell).survey(namespace, number, describe=describe)
