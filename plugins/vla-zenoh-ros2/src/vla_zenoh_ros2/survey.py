@@ -8,7 +8,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from typing import NamedTuple, TypeVar
 
 import zenoh
@@ -188,10 +187,13 @@ class _Look:
 
     def _ask(self, key: str) -> Iterable[tuple[str, bytes]]:
         for reply in self._session.get(key, timeout=ASK_S):
-            if reply.ok is not None:
-                with suppress(CodecError):  # too long for what is asked for here
-                    payload = bytes_of(reply.ok.payload, MAX_REPLY_BYTES)
-                    yield str(reply.ok.key_expr), payload
+            if reply.ok is None:
+                continue
+            try:
+                payload = bytes_of(reply.ok.payload, MAX_REPLY_BYTES)
+            except CodecError:  # too long for what is asked for here
+                continue
+            yield str(reply.ok.key_expr), payload
 
     def _nothing(self, domains: list[RosDomain], number: int | None) -> str:
         if domains:
