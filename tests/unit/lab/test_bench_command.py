@@ -1,12 +1,16 @@
-"""``vla-zenoh bench command``: which robots it is for."""
+"""``vla-zenoh bench command``: which robots it is for, and the loop beside it."""
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 from vla_zenoh_benchmarks import command_runner
+from vla_zenoh_benchmarks.bare_loop import bare_loop
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.program.main import app
@@ -23,3 +27,13 @@ def test_a_robot_of_parts_is_rejected_before_anything_starts(
         "the motion of bench command: for one arm only, and robot 'pair' has the parts left, right"
     )
     assert not out.exists()
+
+
+def test_the_bare_loop_beside_it_counts_what_it_misses() -> None:
+    with bare_loop(100) as bare:
+        (pid,) = map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text().split())
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(0.3)
+        os.kill(pid, signal.SIGCONT)
+        time.sleep(0.2)
+    assert 28 <= bare.missed < bare.ticks

@@ -31,7 +31,8 @@ def command(
 ) -> None:
     """Measure the time per tick of the command node while the simulated arm moves.
 
-    The real nodes are started once per rate.
+    A loop that only sleeps runs beside it, at the same rate and priority: what that misses is the
+    computer's. The real nodes are started once per rate.
     """
     from vla_zenoh.lab.cli.loopback import own_address
     from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
@@ -47,20 +48,22 @@ def command(
         for rate_hz in track(rates_hz, "command node", console=errors()):
             rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
     times = [f"{name} {share}" for name in ("tick us", "late us", "pose ms") for share in SHARES]
-    columns = ("set Hz", "held Hz", "missed", "core share", *times)
+    columns = ("set Hz", "held Hz", "missed", "bare loop", "core share", *times)
     table = new_table(*columns, left=())
     for row in rows:
         table.add_row(
             f"{row['command_hz']:g}",
             f"{row['held_hz']:g}",
             f"{row['missed_ticks']}",
+            f"{row['bare_missed_ticks']} of {row['bare_ticks']}",
             f"{row['core_share']:.2f}",
             *(f"{row['tick_us'][share]:.0f}" for share in SHARES),
             *(f"{row['late_us'][share]:.0f}" for share in SHARES),
             *(f"{row['pose_age_ms'][share]:.0f}" for share in SHARES),
         )
     text = (
-        "tick: from wake-up to the published command. late: wake-up after its time. pose: its age"
+        "bare loop: ticks that one missed which only sleeps. tick: from wake-up to the published "
+        "command. late: wake-up after its time. pose: its age"
     )
     realtime = all(row["realtime"] for row in rows)
     table.caption = text if realtime else f"{text} (no real-time priority here)"

@@ -19,6 +19,7 @@ from vla_zenoh.nodes.command.node import SPREAD_S
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import PoseState
+from vla_zenoh_benchmarks.bare_loop import bare_loop
 
 
 def cpu_s(pid: int) -> float:
@@ -65,10 +66,11 @@ def measure_command(
             raise Interrupted
         pid = host.supervisor.pids()["command"]
         missed, spent_s, began_s = _missed(host), cpu_s(pid), time.monotonic()
-        with _load(busy):
+        with _load(busy), bare_loop(command_hz) as bare:
             if stop.wait(max(seconds, SPREAD_S)):
                 raise Interrupted
             status = client.status("command")
+            missed_ticks = _missed(host) - missed
         spent_s, took_s = cpu_s(pid) - spent_s, time.monotonic() - began_s
         if status is None or status.state != "active":
             found = f"{status.state} ({status.detail.get('why')})" if status else "silent"
@@ -80,7 +82,9 @@ def measure_command(
             "late_us": status.detail["late_us"],
             "pose_age_ms": status.detail["pose_age_ms"],
             "busy": busy,
-            "missed_ticks": _missed(host) - missed,
+            "missed_ticks": missed_ticks,
+            "bare_ticks": bare.ticks,
+            "bare_missed_ticks": bare.missed,
             "core_share": round(spent_s / took_s, 3),
             "realtime": status.detail["realtime"],
             "seconds": round(took_s, 1),
