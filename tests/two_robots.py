@@ -30,7 +30,10 @@ BOUNCER = '''
 # requires-python = ">=3.11"
 # dependencies = ["numpy"]
 # ///
-"""Goes up for a second and down for one, whatever the prompt; one answer takes `slow_s`."""
+"""Goes up for a second and down for one, whatever the prompt; one answer takes `slow_s`.
+
+Outside the heights {low_m} to {high_m} it goes back: what is dropped of chunks would add up.
+"""
 import time
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, ObservationSpec
 
@@ -43,16 +46,26 @@ class Bouncer:
 
     def infer(self, observation):
         time.sleep({slow_s})
-        way_m = 0.01 if observation.stamp_wall_ns // 10**9 % 2 else -0.01
+        height_m = observation.pose.position_m[2]
+        up = observation.stamp_wall_ns // 10**9 % 2 and height_m < {high_m} or height_m < {low_m}
+        way_m = 0.01 if up else -0.01
         return ActionSteps([[0.0, 0.0, way_m, 0.0, 0.0, 0.0]] * {horizon})
 '''
 BOUNCE = "bounce"
 """A prompt for it."""
 
 
-def write_bouncer(path: Path, *, horizon: int = 1, slow_s: float = 0.0) -> None:
-    """A model that moves every arm by 10 mm a step."""
-    path.write_text(BOUNCER.format(horizon=horizon, slow_s=slow_s))
+def write_bouncer(
+    path: Path,
+    *,
+    horizon: int = 1,
+    slow_s: float = 0.0,
+    between_m: tuple[float, float] = (0.0, 1.0),
+) -> None:
+    """A model that moves every arm by 10 mm a step, and turns at heights outside `between_m`."""
+    low_m, high_m = between_m
+    model = BOUNCER.format(horizon=horizon, slow_s=slow_s, low_m=low_m, high_m=high_m)
+    path.write_text(model)
 
 
 @contextmanager

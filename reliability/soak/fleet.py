@@ -48,7 +48,7 @@ from two_robots import BOUNCE, write_bouncer
 from vla_zenoh.bus.buffers import header_of
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 
-HZ, RATE_HZ = 50, 2.5
+HZ, STATE_HZ, RATE_HZ = 50, 25, 2.5
 HORIZON, DT_S = 10, 0.1
 GOOD, SHADES = "good", ("shade", "shade2")
 COMMAND_S, STATE_S = 1.0, 2.0
@@ -78,6 +78,9 @@ QUIET_S, LIFE_S = (2.0, 6.0), 65.0
 """A node is killed again only after it lived for so long: else its supervisor gives it up."""
 RECOVER_S, READY_S = 120.0, 300.0
 STILL_M_S, STANDS_S, CREPT_M = 0.002, 0.2, 0.001
+BETWEEN_M = 0.4, 0.55
+"""Heights at which the models turn: an arm begins at 0.49 and goes at most 0.1 m in a chunk."""
+ACTIVATION_S = 3.0
 ROW = 8 * 8
 ARM = '''
 import time
@@ -115,7 +118,7 @@ serves: {{{serves}}}
 task: {{prompt: hold, rate_hz: {rate_hz}, worker: good}}
 session: {{listen: [{endpoint}], connect: [{endpoint}], lease_ms: {lease_ms}}}
 timing: {{command_timeout_s: {command_s}, state_timeout_s: {state_s}, watchdog_s: {watchdog_s},
-  command_hz: {hz}, state_hz: {hz}}}
+  command_hz: {hz}, state_hz: {state_hz}}}
 hosts: {{here: {{nodes: [{nodes}]}}, gpu: {{nodes: [worker], workers: [{here}]}}}}
 """
 
@@ -305,7 +308,7 @@ class Fleet:
                 chain.client.set_prompt(BOUNCE, 1.0)
             if chain.state() in ("stopped", "fault"):
                 chain.client.publish(chain.client.keys.reset, "")
-            chain.client.activate(1.0)
+            chain.client.activate(ACTIVATION_S)
         return False
 
     # -- judging ------------------------------------------------------------------------------
@@ -376,7 +379,7 @@ class Fleet:
 def write_robots(folder: Path, count: int, *, with_replicas: bool) -> list[Path]:
     """Profiles of all robots, their arm and their models."""
     (folder / "arm.py").write_text(ARM)
-    write_bouncer(folder / "own.py", horizon=HORIZON, slow_s=0.02)
+    write_bouncer(folder / "own.py", horizon=HORIZON, slow_s=0.02, between_m=BETWEEN_M)
     names = [f"r{number + 1}" for number in range(count)]
     models = {name: "./own.py" for name in (GOOD, *SHADES)}
     options, here = "", list(models)
@@ -406,6 +409,7 @@ def write_robots(folder: Path, count: int, *, with_replicas: bool) -> list[Path]
                 state_s=STATE_S,
                 watchdog_s=WATCHDOG_S,
                 hz=HZ,
+                state_hz=STATE_HZ,
                 nodes="router, arm, command" if name == names[0] else "arm, command",
             )
         )
