@@ -64,8 +64,7 @@ class Remembers:
 @contextmanager
 def served(model: Remembers) -> Iterator[Any]:
     """An adapter that asks a server of the model."""
-    robot = load_profile("panda_sim").robot
-    offer = make_served_policy(model, "", robot.arm_joints, robot.gripper.max_width_m)
+    offer = make_served_policy(model, "", load_profile("panda_sim"))
     server = PolicyServer(offer, "127.0.0.1", 0)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()

@@ -1,4 +1,4 @@
-"""Numbers of a robot description that no arm has: degrees for radians, millimetres for metres."""
+"""Numbers that no arm has, described or measured: degrees for radians, millimetres for metres."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from vla_zenoh.kinematics.collision import CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import Limits
+from vla_zenoh.types import GripperState, JointState
 
 MAX_TURN_RAD = 4 * math.pi + 0.1
 """Wrists turn by at most two turns to each side; a range in degrees is beyond this."""
@@ -23,6 +24,10 @@ MIN_ARM_M = 0.05
 """From the first joint to the TCP, stretched: the smallest desk arms have 0.2 m."""
 MAX_LINK_M = 3.0
 """From a joint to the end of the link that it moves."""
+BEYOND = 0.1
+"""A joint at its end may be measured this share of its range beyond it: zero points differ."""
+WIDER_M = 0.01
+"""A gripper may be measured wider than it opens by this."""
 
 
 def implausible(
@@ -86,6 +91,30 @@ def implausible(
                 "correct its size: no barrier can keep it from the arm itself"
             )
     yield from _out_of_reach(kinematics, limits, length_m)
+
+
+def state_fault(
+    kinematics: Kinematics,
+    max_width_m: float,
+    joint: JointState | None,
+    gripper: GripperState | None,
+) -> str:
+    """What this arm cannot have measured, with the unit that it is probably in; empty: nothing."""
+    if joint is not None:
+        here_rad = kinematics.joints_of(joint)
+        lower_rad, upper_rad = kinematics.lower_rad, kinematics.upper_rad
+        slack_rad = BEYOND * (upper_rad - lower_rad)
+        beyond = (here_rad < lower_rad - slack_rad) | (here_rad > upper_rad + slack_rad)
+        for index in np.flatnonzero(beyond).tolist():
+            unit = kinematics.unit(index)
+            return (
+                f"joint {kinematics.arm_joints[index]!r} is at {here_rad[index]:.4g} {unit}, and "
+                f"goes from {lower_rad[index]:.4g} to {upper_rad[index]:.4g}: is this in "
+                f"{'millimetres' if unit == 'm' else 'degrees'}?"
+            )
+    if gripper is not None and gripper.opening_m > max_width_m + WIDER_M:
+        return f"the gripper is {gripper.opening_m:.4g} m wide, and opens to {max_width_m:g} m"
+    return ""
 
 
 def _slides_m(kinematics: Kinematics) -> float:

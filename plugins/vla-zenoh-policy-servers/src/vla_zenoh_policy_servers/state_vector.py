@@ -37,6 +37,7 @@ from vla_zenoh.policy.meaning import (
     QUATERNION_SLACK,
     ROTATION_FORMS,
     SHARE,
+    TURN_RAD,
     GripperScale,
 )
 from vla_zenoh.policy.options import number
@@ -73,6 +74,8 @@ many as the arm has joints."""
 
 _ZEROS = re.compile(r"zero\*([1-9][0-9]{0,3})")
 _WHOLE = {name: (whole, i) for whole, names in COORDINATES.items() for i, name in enumerate(names)}
+MOST_TURNED_RAD = 1.1 * TURN_RAD
+"""A rotation has no larger angles, whatever it is told nearest to."""
 GRIPPERS = ("gripper_m", "fingers_m", "gripper_open", "gripper_closed")
 
 
@@ -227,7 +230,8 @@ class StateNumbers:
             any of ``joint`` (n,) rad, ``position_m`` (3,), ``quat_xyzw`` (4,), ``width_m``.
 
         Raises:
-            SpecError: another count of numbers, or a part that cannot be read back.
+            SpecError: another count of numbers, angles of more than a turn, or a part that cannot
+                be read back.
         """
         if numbers.shape != (self.size,):
             raise SpecError(
@@ -246,6 +250,9 @@ class StateNumbers:
                 out["position_m"] = values * units.position_scale_m
             elif name in ROTATIONS:
                 given = (values * self._unit_of(name)).tolist()
+                if name in SCALED and max(map(abs, given)) > MOST_TURNED_RAD:
+                    why = f"{name} has {max(given, key=abs):.4g} rad: is it in degrees?"
+                    raise SpecError(why, "implausible_state")
                 out["quat_xyzw"] = self._near(ROTATION_FORMS[name].decode(given))
             elif name == "fingers_m":
                 out["width_m"] = float(values[0] - values[1])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from vla_zenoh.control.actions import chunk_poses, step_joints, step_width
 from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.kinematics.kinematics import InverseKinematics, make_kinematics
+from vla_zenoh.kinematics.plausibility import state_fault
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import ChunkPrefix
@@ -97,15 +99,15 @@ class Answers:
             CodecError: the observation is not what the file declares.
             PeerError, SpecError, RecordError: the model has no answer, or one that is refused.
         """
-        numbers = self._numbers.ordered(seen.names, seen.position)
-        joints_rad, width_m = self._numbers.ours(numbers)
-        observation = self._observe(seen, joints_rad, float(width_m))
+        joint, gripper = self._measured(seen)
+        joints_rad, width_m = joint.position_rad, gripper.width_m or 0.0
+        observation = self._observe(seen, joint, gripper)
         result: Any = self._policy.infer(self._followed.with_progress(observation))
         steps = check_steps(
             self._policy.spec.action, result.steps if isinstance(result, ActionSteps) else result
         )
         self._followed.published(observation, steps, observation.stamp_wall_ns, obeyed=True)
-        start_rad, start_m = self._start(joints_rad, float(width_m))
+        start_rad, start_m = self._start(joints_rad, width_m)
         ends_rad, widths_m = self._ends(steps, start_rad, start_m)
         rows_rad, rows_m = self._resampled(start_rad, start_m, ends_rad, widths_m)
         self._refuse(joints_rad, rows_rad)
@@ -113,7 +115,22 @@ class Answers:
         position = self._numbers.theirs(rows_rad, rows_m)
         return Steps(stamp_ms, seen.id, self._numbers.order, position)
 
-    def _observe(self, seen: Seen, joints_rad: FloatArray, width_m: float) -> Observation:
+    def _measured(self, seen: Seen) -> tuple[JointState, GripperState]:
+        """Joints and gripper of an observation; a `CodecError` where they are not this arm's."""
+        numbers = self._numbers.ordered(seen.names, seen.position)
+        joints_rad, opening_m = self._numbers.ours(numbers)
+        still, endless = np.zeros(len(joints_rad)), itertools.compress(self._joints, self._endless)
+        joint = JointState(self._joints, joints_rad, still, still, endless=tuple(endless))
+        width_m = float(opening_m) if self._numbers.grips else None
+        gripper = GripperState(width_m, moving=False, holding=False)
+        most_m = self._profile.robot.max_width_m
+        if why := state_fault(self._kinematics, most_m, joint, gripper):
+            raise CodecError("implausible_state", f"joint_states: {why}")
+        if width_m is not None:
+            gripper = replace(gripper, width_m=min(max(width_m, 0.0), most_m))
+        return joint, gripper
+
+    def _observe(self, seen: Seen, joint: JointState, gripper: GripperState) -> Observation:
         spec, images = self._policy.spec.observation, {}
         for wanted in spec.cameras:
             camera = self._robot.cameras[wanted.camera]
@@ -127,15 +144,13 @@ class Answers:
             images[wanted.camera] = prepare_image(image, wanted)
         if spec.prompt and not seen.task:
             raise CodecError("task", "task is empty, and the model needs a prompt")
-        still, state = np.zeros(len(joints_rad)), dict[str, Any]()
+        state = dict[str, Any]()
         if "joint" in spec.state:
-            endless = itertools.compress(self._joints, self._endless)
-            measured = JointState(self._joints, joints_rad, still, still, endless=tuple(endless))
-            state["joint"] = joints_as(measured, self._policy.spec.action.turns)
+            state["joint"] = joints_as(joint, self._policy.spec.action.turns)
         if "gripper" in spec.state:
-            state["gripper"] = GripperState(width_m, moving=False, holding=False)
+            state["gripper"] = gripper
         if "pose" in spec.state:
-            pose = self._kinematics.forward(joints_rad[self._in_chain])
+            pose = self._kinematics.forward(joint.position_rad[self._in_chain])
             quat = quat_from_rotation(pose.rotation)
             state["pose"] = PoseState(pose.position_m, quat, np.zeros(6))
         hz = 1.0 / self._policy.spec.action.dt_s

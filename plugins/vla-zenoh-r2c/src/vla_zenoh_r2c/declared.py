@@ -185,14 +185,14 @@ class Numbers:
     def ours(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Joints (..., k) in rad and the width (...) in m of numbers (..., n) in order.
 
-        The width is 0 where there is no gripper.
+        The width is 0 where there is no gripper, and not bounded where there is one.
         """
         joints_rad = (values[..., self._columns] - self._zero) / self._per_rad
         if self._gripper is None:
             return joints_rad, np.zeros(values.shape[:-1])
         number = values[..., self.order.index(self._gripper.name)]
         share = (number - self._gripper.shut) / (self._gripper.open - self._gripper.shut)
-        return joints_rad, np.clip(share, 0.0, 1.0) * self._max_width_m
+        return joints_rad, share * self._max_width_m
 
     def theirs(self, joints_rad: FloatArray, width_m: FloatArray) -> FloatArray:
         """Numbers (..., n) in order of joints (..., k) in rad and widths (...) in m."""

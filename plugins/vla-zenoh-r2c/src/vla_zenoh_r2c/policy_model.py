@@ -101,6 +101,7 @@ class R2cPolicy:
             found = self._take()
             if found is not None:
                 joints_rad, width_m = self._numbers.ours(found)
+                width_m = np.clip(width_m, 0.0, self._profile.robot.max_width_m)
                 parts = (joints_rad, width_m[:, None]) if self._numbers.grips else (joints_rad,)
                 steps = np.concatenate(parts, axis=1)
                 return ActionSteps(steps, raw={"ignored_answers": self._question.ignored})

@@ -8,7 +8,6 @@ import threading
 from typing import Annotated
 
 import typer
-from vla_zenoh_policy_servers.state_vector import home_reference
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -23,11 +22,9 @@ from vla_zenoh.cli.output import console
 from vla_zenoh.lab.cli.loopback import require_loopback
 from vla_zenoh.plugins import how_to_repeat
 from vla_zenoh.policy.loader import make_policy
-from vla_zenoh.policy.meaning import IDENTITY
 from vla_zenoh.runtime.environments import run_in_own_environment
 from vla_zenoh.runtime.process import stop_on_signals
 from vla_zenoh_serve import openpi_server
-from vla_zenoh_serve.served_policy import make_served_policy
 
 
 @options
@@ -70,19 +67,14 @@ def serve(
             "give --api-key KEY (VLA_ZENOH_API_KEY; not encrypted), or leave it out and "
             f"type on the other computer `ssh -L {port}:127.0.0.1:{port} THIS_COMPUTER`",
         )
-    robot, chosen = loaded.robot, model.choose(loaded, worker)
+    chosen = model.choose(loaded, worker)
     ours = how_to_repeat("vla-zenoh-serve")
     run_in_own_environment(chosen.model, model.python, extra="control", packages=ours)
     from vla_zenoh_serve.policy_server import PolicyServer
+    from vla_zenoh_serve.served_policy import make_served_policy
 
     policy = make_policy(chosen.model, chosen.options, profile=profile)
-    offer = make_served_policy(
-        policy,
-        names,
-        robot.arm_joints,
-        robot.max_width_m,
-        home_reference(loaded) if "pose" in policy.spec.observation.state else IDENTITY,
-    )
+    offer = make_served_policy(policy, names, loaded)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     getattr(policy, "load", lambda: None)()
     stop = stop_on_signals()
@@ -93,4 +85,6 @@ def serve(
         console().print(f"  {name}: {what}", highlight=False)
     stop.wait()
     server.stop()
+    told = {"answered": server.tally.answered, **server.tally.refused}
+    console().print(", ".join(f"{name} {count}" for name, count in told.items()), highlight=False)
     os._exit(0)  # threads of a model's library may keep the process alive

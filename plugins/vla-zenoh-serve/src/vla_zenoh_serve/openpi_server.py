@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -21,7 +23,7 @@ from vla_zenoh.types import shown
 from vla_zenoh_serve.served_policy import ServedPolicy
 
 PORT = 8000
-HEALTH_PATH = "/healthz"
+HEALTH_PATH, STATUS_PATH = "/healthz", "/status"
 MAX_BYTES = message.MAX_PAYLOAD_BYTES
 SPEC = "vla_zenoh_action"
 """Where a server of ours says what its actions mean."""
@@ -35,11 +37,30 @@ MAX_ERROR = 1000
 LOG = logging.getLogger("vla_zenoh.serve")
 
 
-class OpenPiConversation:
-    """One connection of an openpi client."""
+@dataclass(slots=True)
+class Tally:
+    """What clients asked and were told.
 
-    def __init__(self, policy: ServedPolicy) -> None:
-        self._policy = policy
+    Args:
+        answered: requests that got actions.
+        refused: the others, by reason.
+        last: why the newest of them was refused.
+    """
+
+    answered: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    last: str = ""
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"answered": self.answered, "refused": dict(self.refused), "last_refused": self.last}
+
+
+class OpenPiConversation:
+    """One connection of an openpi client; `tally` counts what it asked."""
+
+    def __init__(self, policy: ServedPolicy, tally: Tally) -> None:
+        self._policy, self._tally = policy, tally
         self._prompt: str | None = None
         self._previous_ms: float | None = None
 
@@ -63,9 +84,12 @@ class OpenPiConversation:
             committed = read_committed(given, self._policy.spec.action)
             actions = self._policy.infer(observation, committed)
         except Exception as error:  # sent to the client as openpi does; it may reconnect
-            why = error if isinstance(error, (PeerError, SpecError)) else repr(error)
-            LOG.warning("request rejected: %s", why)
-            return in_words(error)[:MAX_ERROR]
+            known = isinstance(error, (PeerError, SpecError))
+            LOG.warning("request rejected: %s", error if known else repr(error))
+            self._tally.refused[error.reason if known else "model_failed"] += 1
+            self._tally.last = in_words(error)[:MAX_ERROR]
+            return self._tally.last
+        self._tally.answered += 1
         answer = pack_answer(actions, (time.monotonic() - began_s) * 1e3, self._previous_ms)
         self._previous_ms = (time.monotonic() - began_s) * 1e3
         return answer

@@ -6,6 +6,7 @@ It serves one client at a time, as a model may keep state; a second client is re
 from __future__ import annotations
 
 import hmac
+import json
 import threading
 from http import HTTPStatus
 
@@ -13,7 +14,13 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
-from vla_zenoh_serve.openpi_server import HEALTH_PATH, MAX_BYTES, OpenPiConversation
+from vla_zenoh_serve.openpi_server import (
+    HEALTH_PATH,
+    MAX_BYTES,
+    STATUS_PATH,
+    OpenPiConversation,
+    Tally,
+)
 from vla_zenoh_serve.served_policy import ServedPolicy
 
 INTERNAL_ERROR, TRY_AGAIN_LATER = 1011, 1013
@@ -29,6 +36,7 @@ class PolicyServer:
 
     def __init__(self, policy: ServedPolicy, host: str, port: int, api_key: str = "") -> None:
         self._policy, self._key = policy, api_key
+        self.tally = Tally()
         self._busy = threading.Lock()
         self._server: Server = serve(
             self._handle,
@@ -55,6 +63,8 @@ class PolicyServer:
         given = request.headers.get("Authorization", "").encode()
         if self._key and not hmac.compare_digest(given, f"Api-Key {self._key}".encode()):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "wrong or no API key\n")
+        if request.path == STATUS_PATH:
+            return connection.respond(HTTPStatus.OK, json.dumps(self.tally.summary()) + "\n")
         if self._busy.locked():
             return connection.respond(
                 HTTPStatus.SERVICE_UNAVAILABLE, "another client is connected\n"
@@ -73,7 +83,7 @@ class PolicyServer:
             self._busy.release()
 
     def _serve(self, connection: ServerConnection) -> None:
-        conversation = OpenPiConversation(self._policy)
+        conversation = OpenPiConversation(self._policy, self.tally)
         connection.send(conversation.greeting())
         while True:
             reply = conversation.reply(connection.recv())

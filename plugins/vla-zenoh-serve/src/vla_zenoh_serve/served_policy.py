@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,19 +13,26 @@ from vla_zenoh_policy_servers.field_mapping import FieldSource, read_map
 from vla_zenoh_policy_servers.state_vector import (
     ROTATIONS,
     StateNumbers,
+    home_reference,
     parts_of,
     read_parts,
+    state_numbers,
 )
 
 from vla_zenoh.errors import PeerError, RecordError, SpecError
+from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
+from vla_zenoh.kinematics.plausibility import MAX_LENGTH_M, state_fault
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import ChunkPrefix, Committed
-from vla_zenoh.policy.meaning import IDENTITY
+from vla_zenoh.policy.meaning import IDENTITY, TURN_RAD, joints_as
 from vla_zenoh.policy.observation import prepare_image
+from vla_zenoh.profile import Profile, RobotProfile
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
 
 ROUNDING = 0.01
 """Floats of an image that was resized are beyond 0 to 1 by this much."""
+IMPLAUSIBLE = "implausible_state"
+"""Reason of numbers that this arm cannot have measured."""
 _OF_PART = {"pose": "position+quat_xyzw", "gripper": "gripper_m", "joint": "joint"}
 
 
@@ -34,13 +42,15 @@ class ServedPolicy:
 
     Args:
         fields: name -> what it holds.
-        joints: names of the arm's joints, in the order in which they are given.
+        arm: that the client moves.
+        robot: section of its profile; its joints are given in this order.
         states: name -> the numbers of its state.
     """
 
     policy: Policy
     fields: Mapping[str, FieldSource]
-    joints: tuple[str, ...]
+    arm: Kinematics
+    robot: RobotProfile
     states: Mapping[str, StateNumbers]
     _followed: ChunkPrefix = field(init=False)
 
@@ -90,7 +100,8 @@ class ServedPolicy:
         Twists and joint velocities, which such a question does not hold, are zero.
 
         Raises:
-            PeerError: a name is missing or holds something else; says what is wanted.
+            PeerError: a name is missing or holds something else, or what this arm cannot have
+                measured; says what is wanted.
         """
         described = self.described()
         missing = [f"{name} ({what})" for name, what in described.items() if name not in given]
@@ -119,18 +130,40 @@ class ServedPolicy:
             )
         except (RecordError, SpecError, ValueError, TypeError) as error:
             wanted = "; ".join(f"{name}: {what}" for name, what in described.items())
-            raise PeerError("peer_request", f"{error} (wanted: {wanted})") from error
+            reason = getattr(error, "reason", "peer_request")
+            raise PeerError(reason, f"{error} (wanted: {wanted})") from error
 
     def _state(self, state: Mapping[str, Any]) -> dict[str, Any]:
-        asked, none = self.spec.observation.state, np.zeros(len(self.joints))
-        out: dict[str, Any] = {}
+        asked, out = self.spec.observation.state, dict[str, Any]()
         if "pose" in asked:
             out["pose"] = PoseState(state["position_m"], state["quat_xyzw"], np.zeros(6))
+            if (away_m := float(np.linalg.norm(out["pose"].position_m))) > MAX_LENGTH_M:
+                why = f"the TCP is {away_m:.4g} m from the base: is this in millimetres?"
+                raise SpecError(why, IMPLAUSIBLE)
         if "gripper" in asked:
             out["gripper"] = GripperState(state["width_m"], moving=False, holding=False)
         if "joint" in asked:
-            out["joint"] = JointState(self.joints, state["joint"], none, none)
+            out["joint"] = self._joint(state["joint"])
+        if why := state_fault(
+            self.arm, self.robot.max_width_m, out.get("joint"), out.get("gripper")
+        ):
+            raise SpecError(why, IMPLAUSIBLE)
         return out
+
+    def _joint(self, position_rad: NDArray[np.float64]) -> JointState:
+        """The joints, those that turn without an end as the model declares them."""
+        names = self.robot.arm_joints
+        endless = tuple(itertools.compress(self.arm.arm_joints, self.arm.endless))
+        turns, none = self.spec.action.turns, np.zeros(len(names))
+        far = np.isin(names, endless) & (np.abs(position_rad) > TURN_RAD)
+        if turns == "wrapped" and far.any():
+            first = int(np.flatnonzero(far)[0])
+            raise SpecError(
+                f"joint {names[first]!r} turns without an end and is at {position_rad[first]:.4g} "
+                "rad; wanted within (-pi, pi]: is this in degrees?",
+                IMPLAUSIBLE,
+            )
+        return joints_as(JointState(names, position_rad, none, none, endless=endless), turns)
 
 
 def _numbers(name: str, value: Any) -> NDArray[np.float64]:
@@ -138,6 +171,8 @@ def _numbers(name: str, value: Any) -> NDArray[np.float64]:
     given = np.asarray(value)
     if given.dtype.kind not in "iuf":
         raise PeerError("peer_request", f"{name} holds no numbers: {shown(value)}")
+    if not np.isfinite(given).all():
+        raise PeerError("peer_request", f"{name} holds NaN or infinity: {shown(given.tolist())}")
     return np.atleast_1d(given).astype(np.float64)
 
 
@@ -163,23 +198,19 @@ def _pixels(name: str, value: Any) -> NDArray[np.uint8]:
     return np.ascontiguousarray(scale * given.clip(0, most)).astype(np.uint8)
 
 
-def make_served_policy(
-    policy: Policy,
-    map_option: str,
-    joints: tuple[str, ...],
-    max_width_m: float,
-    reference: tuple[float, ...] = IDENTITY,
-) -> ServedPolicy:
+def make_served_policy(policy: Policy, map_option: str, profile: Profile) -> ServedPolicy:
     """The offer of a model: ``prompt`` and fields ``observation/CAMERA``, ``observation/pose``, ...
 
-    `map_option` names things otherwise.
+    `map_option` names things otherwise; the profile is of the arm that the client moves.
 
-    The model is given the quaternion, of the two, that is nearer to the `reference` x, y, z, w,
-    whatever the client sends.
+    The model is given the quaternion, of the two, that is nearer to the home orientation, whatever
+    the client sends.
 
     Raises:
         SpecError: what the model needs is not named, or named twice.
+        ProfileError, ResourceError: the kinematics of the one arm cannot be made.
     """
+    profile.require_one_arm("serve policy")
     spec = policy.spec
     senses = {
         "depth": bool(spec.observation.depth),
@@ -210,9 +241,10 @@ def make_served_policy(
     parts = {part for source in fields.values() for part in source.parts}
     if "pose" in spec.observation.state and not ("position" in parts and parts & set(ROTATIONS)):
         raise SpecError(f"map must give the whole pose: position and one of {', '.join(ROTATIONS)}")
+    near = home_reference(profile) if "pose" in spec.observation.state else IDENTITY
     states = {
-        name: StateNumbers(source.parts, joints, max_width_m, reference=reference)
+        name: replace(state_numbers(source.parts, profile), reference=near)
         for name, source in fields.items()
         if source.parts
     }
-    return ServedPolicy(policy, fields, joints, states)
+    return ServedPolicy(policy, fields, make_kinematics(profile), profile.robot, states)

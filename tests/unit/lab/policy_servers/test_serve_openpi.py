@@ -216,8 +216,7 @@ def model() -> Policy:
 
 
 def offer(names: str = "") -> Any:
-    robot = load_profile("panda_sim").robot
-    return make_served_policy(model(), names, robot.arm_joints, robot.gripper.max_width_m)
+    return make_served_policy(model(), names, load_profile("panda_sim"))
 
 
 def test_the_names_of_an_offer_can_be_those_of_liberos_clients() -> None:
@@ -300,14 +299,10 @@ def test_what_is_no_image_is_named(image: Any, why: str) -> None:
 
 
 def test_a_model_is_given_the_same_sign_whichever_a_client_sends() -> None:
-    robot = load_profile("panda_sim").robot
-    down = (1.0, 0.0, 0.0, 0.0)
-    served = make_served_policy(
-        model(), "", robot.arm_joints, robot.gripper.max_width_m, reference=down
-    )
+    """That nearer to the home orientation, which points down."""
     for sign in (1.0, -1.0):
         pose = np.array([0.4, 0, 0.3, sign, 0, 0, 1e-4])
-        seen = served.observe({**ASKED, "observation/pose": pose}, 5)
+        seen = offer().observe({**ASKED, "observation/pose": pose}, 5)
         assert seen.pose is not None
         assert seen.pose.quat_xyzw[0] == pytest.approx(1.0)
 
