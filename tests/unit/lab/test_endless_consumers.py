@@ -5,7 +5,9 @@ Numpy's warnings are errors here: an infinite range that becomes no number fails
 
 from __future__ import annotations
 
+import ast
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -83,6 +85,61 @@ def test_every_file_that_reads_the_ends_of_ranges_is_tried_without_them() -> Non
     found |= {f"src/vla_zenoh/{name}.py" for name in inner}
     assert found == TRIED.keys()
     tests = [test for test in TRIED.values() if test.endswith(".py")]
+    assert all((ROOT / "tests" / test).exists() for test in tests)
+
+
+COUNTED = "both are counted over turns, as everything on the bus and in a plan is"
+NEAREST = "one of them is the nearest turn to the other"
+APART = {
+    "src/vla_zenoh/control/actions.py": "unit/policy/test_turns.py",
+    "src/vla_zenoh/control/joint_follower.py": NEAREST,
+    "src/vla_zenoh/control/joint_space.py": COUNTED,
+    "src/vla_zenoh/control/motion_pipeline.py": COUNTED,
+    "src/vla_zenoh/control/part_spacing.py": COUNTED,
+    "src/vla_zenoh/control/plan_timeline.py": COUNTED,
+    "src/vla_zenoh/control/pose_to_joint.py": NEAREST,
+    "src/vla_zenoh/control/preflight.py": COUNTED,
+    "src/vla_zenoh/control/reachability.py": COUNTED,
+    "src/vla_zenoh/control/step_space.py": COUNTED,
+    "src/vla_zenoh/guard/arm_guard.py": COUNTED,
+    "src/vla_zenoh/guard/stream_guard.py": COUNTED,
+    "src/vla_zenoh/lab/check/fit.py": "unit/policy/test_turns.py",
+    "src/vla_zenoh/policy/frozen.py": "unit/policy/test_turns.py",
+    "src/vla_zenoh/simulation/impedance.py": COUNTED,
+    "plugins/vla-zenoh-primitives/src/vla_zenoh_primitives/endings.py": HERE,
+    "plugins/vla-zenoh-primitives/src/vla_zenoh_primitives/node.py": NEAREST,
+    "plugins/vla-zenoh-primitives/src/vla_zenoh_primitives/target_check.py": HERE,
+    "plugins/vla-zenoh-r2c/src/vla_zenoh_r2c/answer.py": NEAREST,
+    "plugins/vla-zenoh-trossen/src/vla_zenoh_trossen/arm.py": FIXED,
+    "plugins/vla-zenoh-trossen/src/vla_zenoh_trossen/bounds.py": FIXED,
+    "models/scripted_pair.py": FIXED,
+    "models/scripted_pick.py": FIXED,
+}
+"""File that subtracts angles of joints -> the test of it over half a turn, or why it is right."""
+ANGLES = re.compile(
+    r"(joints?|position|target|here|measured|start|before|after|asked|wanted|reference|leader|home|"
+    r"goal|at|held|known|others|end|rows?)_rad\b|\bjoints\b"
+)
+
+
+def subtracts_joints(node: ast.AST) -> bool:
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
+        return all(ANGLES.search(ast.unparse(side)) for side in (node.left, node.right))
+    return isinstance(node, ast.Call) and bool(
+        re.match(r"np\.diff\((steps|joints|rows_rad|ways)\b", ast.unparse(node))
+    )
+
+
+def test_every_file_that_subtracts_angles_of_joints_is_right_over_half_a_turn() -> None:
+    found = {
+        str(file.relative_to(ROOT))
+        for folder in ("src", "plugins", "models")
+        for file in (ROOT / folder).rglob("*.py")
+        if ".venv" not in file.parts
+        and any(map(subtracts_joints, ast.walk(ast.parse(file.read_text()))))
+    }
+    assert found == APART.keys()
+    tests = [test for test in APART.values() if test.endswith(".py")]
     assert all((ROOT / "tests" / test).exists() for test in tests)
 
 

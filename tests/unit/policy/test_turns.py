@@ -11,15 +11,18 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from endless_arm import ENDLESS, endless_arm
+from vla_zenoh_dataset.episodes import _as_deltas
 from vla_zenoh_dataset.features import _actions, worker_options
 from vla_zenoh_policy_servers.action_semantics import read_action_semantics
 from vla_zenoh_policy_servers.state_vector import StateNumbers
 
+from vla_zenoh.lab.check.fit import check_chunk
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.frozen import FrozenImages
 from vla_zenoh.policy.inference import ChunkPrefix, Committed
 from vla_zenoh.policy.meaning import joints_as, nearest_turn, wrapped
 from vla_zenoh.policy.observation import Streams, assemble
+from vla_zenoh.profile import Limits
 from vla_zenoh.types import Header, JointState, Stamped, Task
 
 TURN = 2 * math.pi
@@ -127,6 +130,29 @@ def test_an_arm_that_crosses_half_a_turn_has_not_moved_far() -> None:
     assert not images.judge(look(math.pi - 0.01, 2.0))
     assert not images.judge(look(math.pi + 0.01, 1.0))
     assert images.judge(look(math.pi + 0.5, 0.0))
+
+
+def test_deltas_from_a_start_are_exported_without_the_turn_of_a_reading_at_pi() -> None:
+    """And a joint with ends keeps its long step."""
+    part = SimpleNamespace(joints=[SimpleNamespace(record=state(3.0))])
+    run: Any = SimpleNamespace(of_part=lambda _: part)
+    changed = {"kind": "delta", "relative_to": "start"}
+    spec = model("wrapped").action.model_copy(update=changed)
+    wrist_rad = wrapped(3.0 + 0.08 * np.arange(1, 5)) - 3.0
+    steps = np.stack([wrist_rad, np.full(4, 4.0)], axis=1).astype(np.float32)
+    assert wrist_rad.min() < -6.0
+    meant, rows = _as_deltas(run, spec, steps)
+    assert meant.relative_to == "previous"
+    assert rows[:, 0] == pytest.approx(0.08, abs=1e-6)
+    assert rows[:, 1] == pytest.approx([4.0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(("turns", "told"), [("wrapped", False), ("counted", True)])
+def test_a_check_takes_no_step_over_half_a_turn_for_a_whole_one(turns: Turns, told: bool) -> None:
+    wrist_rad = wrapped(3.08 + 0.02 * np.arange(1, 5))
+    steps = np.stack([wrist_rad, np.full(4, 2.0)], axis=1).astype(np.float32)
+    found = check_chunk(model(turns).action, steps, Limits(), 0.08)
+    assert any(each.name == "speed_limit" for each in found) == told
 
 
 @pytest.mark.parametrize("turns", ["wrapped", "counted"])

@@ -166,7 +166,7 @@ def _episode(
     run: Run, whose: str, led: list[Span], carried_out: list[RecordedSample], people: set[str]
 ) -> RecordedEpisode:
     own = [chunk for span in led if span[2] == whose for chunk in _within(span, carried_out)]
-    spec, own = _one_by_one(*_in_order_of_profile(run, _spec_of(run, own), own))
+    spec, own = _one_by_one(run, *_in_order_of_profile(run, _spec_of(run, own), own))
     mixed = any(worker != whose for _, _, worker in led)
     motion = commanded_motion(run, spec.action) if mixed else None
     parts = [(span, _within(span, own)) for span in led]
@@ -236,26 +236,36 @@ def _in_order_of_profile(
 
 
 def _one_by_one(
-    spec: ModelSpec, chunks: list[RecordedSample]
+    run: Run, spec: ModelSpec, chunks: list[RecordedSample]
 ) -> tuple[ModelSpec, list[RecordedSample]]:
     """Chunks whose steps mean something one by one, also apart from the start of their chunk."""
     if all(spec.action.of(part).relative_to == "previous" for part in spec.parts):
         return spec, chunks
     action, out = spec.action, []
     for chunk in chunks:
-        action, steps = _as_deltas(spec.action, chunk.record.steps)
+        action, steps = _as_deltas(run, spec.action, chunk.record.steps)
         record = replace(chunk.record, steps=steps.astype(np.float32))
         out.append(chunk._replace(record=record))
     return spec.model_copy(update={"action": action}), out
 
 
+def endless_joints(run: Run, spec: ActionSpec, part: str) -> NDArray[np.bool_]:
+    """Which of the joints (n,) of a part's actions turn without an end."""
+    measured = run.of_part(part).joints
+    endless = measured[0].record.endless if measured else ()
+    return np.array([name in endless for name in spec.joints], bool)
+
+
 def _as_deltas(
-    spec: ActionSpec, steps: NDArray[np.float32]
+    run: Run, spec: ActionSpec, steps: NDArray[np.float32]
 ) -> tuple[ActionSpec, NDArray[np.float64]]:
     """`as_deltas` of every part."""
     if not spec.parts:
-        return as_deltas(spec, steps)
-    own = {p.part: as_deltas(p.action, steps[:, spec.columns(p.part)]) for p in spec.parts}
+        return as_deltas(spec, steps, endless_joints(run, spec, ""))
+    own = {
+        part: as_deltas(action, steps[:, spec.columns(part)], endless_joints(run, action, part))
+        for part, action in ((each.part, each.action) for each in spec.parts)
+    }
     action = ActionSpec.of_parts({part: meant for part, (meant, _) in own.items()})
     return action, np.concatenate([rows for _, rows in own.values()], axis=1)
 

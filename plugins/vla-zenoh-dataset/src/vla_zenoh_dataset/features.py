@@ -35,7 +35,7 @@ from vla_zenoh.policy.meaning import ROTATION_FORMS, joints_as, unturned, wrappe
 from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Task
-from vla_zenoh_dataset.episodes import RecordedEpisode
+from vla_zenoh_dataset.episodes import RecordedEpisode, endless_joints
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 LEAST_SPREAD = 1e-6
@@ -287,9 +287,8 @@ def actions_of(episode: RecordedEpisode) -> NDArray[np.float32]:
 
 
 def _actions(spec: ActionSpec, steps: NDArray[np.float32], run: Run, part: str) -> NDArray[Any]:
-    measured = run.of_part(part).joints
-    if spec.space == "joint" and spec.kind == "absolute" and spec.turns == "wrapped" and measured:
-        endless = np.flatnonzero(np.isin(spec.joints, measured[0].record.endless))
+    if spec.space == "joint" and spec.kind == "absolute" and spec.turns == "wrapped":
+        endless = np.flatnonzero(endless_joints(run, spec, part))
         steps = steps.copy()
         steps[:, endless] = wrapped(steps[:, endless])
     if not in_lerobots_numbers(spec):

@@ -23,6 +23,7 @@ from vla_zenoh.control.policy_check import (
 )
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec
+from vla_zenoh.policy.meaning import wrapped
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 
 SHAPE_TOLERANCE = 0.02
@@ -173,6 +174,8 @@ def _joint_steps(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Fin
         joints = joints * spec.dt_s
     elif spec.targets:
         joints = np.diff(joints, axis=0)
+        if spec.turns == "wrapped":  # more than half a turn is a step over pi
+            joints = wrapped(joints)
     ways = np.abs(joints).max(axis=0, initial=0.0)
     if (not spec.targets) and ways.max() > limits.step_rad * (1 + ROUNDING):
         if ways.max() > REJECT_FACTOR * limits.step_rad:
