@@ -275,7 +275,6 @@ class JointPath(AxisSmoother):
         self.kinematics, self._bounds = bounds.kinematics, bounds
         self._names = bounds.kinematics.arm_joints
         self._tcp_box = motion_limits(profile.limits).box
-        self._ticks = 0
         self._check_ticks = max(round(CHECK_S * profile.timing.command_hz), 1)
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
@@ -293,6 +292,8 @@ class JointPath(AxisSmoother):
     def stand(self, position: FloatArray) -> None:
         super().stand(position)
         self._before_bound = False
+        self._unchecked = 0
+        """Ticks since distances were looked at."""
         self._floor = np.full(len(self._bounds.barriers.stop), -np.inf)
         """(n,) greatest violation of each distance that is left, see `JointBounds.raised`."""
         self._held = self._bounds.barriers.collisions.held
@@ -353,7 +354,8 @@ class JointPath(AxisSmoother):
         """
         self._asked, self._before_bound = (goal, shares, all_to_stop), False
         here_rad, end_rad = self.state.position, goal.known_rad
-        near_hit = self._near_hit()
+        self._raise_floor()
+        near_hit = None if self._goes else self._near_hit()
         if near_hit is not None:
             self._brake_at(near_hit)
             return True
@@ -367,17 +369,18 @@ class JointPath(AxisSmoother):
                 low, high = (low, middle) if found else (middle, high)
             end_rad = here_rad + low * way_rad
         planned = self.move_to(end_rad, shares, all_to_stop=all_to_stop)
-        if not self.braking and not self.at_rest:  # it may get faster until the next check
-            self._brake_at(self._near_hit())
+        if self._goes:
+            self._check()
         return planned
 
     def tick(self, part: float = 1.0) -> Motion:
         """Advance by `part` of a tick; brakes where the motion would come too near to a bound."""
-        self._ticks += 1
         if self._before_bound and self.at_rest:
             self._go_on()
-        if self._ticks % self._check_ticks == 0 and not self.braking and not self.at_rest:
-            self._brake_at(self._near_hit())
+        if self._unchecked >= self._check_ticks and self._goes:
+            self._raise_floor()
+            self._check()
+        self._unchecked += 1
         before = self.state
         moves = self.advance(part)
         if moves and not self.braking and not self._stops_inside(part):
@@ -408,15 +411,27 @@ class JointPath(AxisSmoother):
             self.brake()
             self._before_bound = True
 
+    def _check(self) -> None:
+        """Brake if the motion would come too near; it may get faster until the next check."""
+        self._unchecked = 0
+        self._brake_at(self._near_hit())
+
+    @property
+    def _goes(self) -> bool:
+        return not (self.braking or self.at_rest)
+
+    def _raise_floor(self) -> None:
+        held = self._bounds.barriers.collisions.held
+        if held != self._held:  # what is too near now may move away
+            self._held, self._floor = held, np.full(len(self._floor), -np.inf)
+        self._floor = self._bounds.raised(self._floor, self.state.position)
+
     def _near_hit(self) -> LimitHit | None:
         """The distance that would be too small at the end of a stop, begun before the next check.
 
         Of an arm that stands: after the first bit of the way to what was asked for last.
         """
-        here_rad, held = self.state.position, self._bounds.barriers.collisions.held
-        if held != self._held:  # what is too near now may move away
-            self._held, self._floor = held, np.full(len(self._floor), -np.inf)
-        self._floor = self._bounds.raised(self._floor, here_rad)
+        here_rad = self.state.position
         if self.at_rest:
             way_rad = self._asked[0].known_rad - here_rad
             longest_rad = float(np.abs(way_rad).max())
@@ -432,6 +447,7 @@ class JointPath(AxisSmoother):
         goal, shares, all_to_stop = self._asked
         self._before_bound = False
         here_rad, goal_rad = self.state.position, goal.known_rad
+        self._raise_floor()
         near_hit = self._near_hit()
         if not (near_hit or self._bounds.ahead_hit(here_rad, goal_rad, self._floor)):
             self.go_to(goal, shares, all_to_stop=all_to_stop)
