@@ -27,6 +27,9 @@ WAY_M = 0.06
 AWAY_S = 1.0
 STANDS_M, JUMP_M, FASTEST_M_S = 0.0005, 0.003, 0.3
 STEP_M, EXACT_M = 0.01, 1e-6
+CAME_M = 0.03
+"""So far an arm may be led by the one old pose until ours is there; where the last one stood is
+60 mm away."""
 
 
 def stands_after(lab: RosLab, harm: Callable[[], None]) -> np.ndarray:
@@ -102,12 +105,12 @@ def test_the_robots_own_node_is_killed_and_comes_back_elsewhere(ros_lab: RosLab)
     time.sleep(2.0)
     stood = ros_lab.arm.wait_still()
     goals = ros_lab.arm.since(told, "goal")
-    away_m = np.linalg.norm([goal["goal"] - stood[:3, 3] for goal in goals], axis=1)
-    assert (away_m > EXACT_M).sum() <= 1, goals
+    assert len(goals) <= 2, goals
     assert goals[-1]["stamp_ns"] > before_ns, ros_lab.story()
     assert stood[:3, 3] == pytest.approx(goals[-1]["goal"], abs=EXACT_M)
     came_m = np.linalg.norm(stood[:3, 3] - panda_dh.forward(np.array(panda_dh.HOME_RAD))[:3, 3])
     print(f"\n{1e3 * came_m:.1f} mm away from where it came back")
+    assert came_m < CAME_M
     events = [event for _, _, event in ros_lab.chain.client.pop_events()]
     assert any(event.what == "robot_returned" for event in events), ros_lab.story()
     obeys_again(ros_lab, stood, time.monotonic_ns())

@@ -110,6 +110,11 @@ class ArmGuard:
         return self._active.moving
 
     @property
+    def at_rest(self) -> bool:
+        """The reference stands, and the followed stream, if there is one, does too."""
+        return self._active.at_rest
+
+    @property
     def writer(self) -> str:
         """Source of the stream that is being followed, empty if none is."""
         return self._writer if self.following else ""

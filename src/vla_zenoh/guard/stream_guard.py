@@ -282,7 +282,12 @@ class StreamGuard(ABC, Generic[Reference]):
     @property
     def moving(self) -> bool:
         """A stream is followed, or the last one is still being brought to rest."""
-        return self.following or self._governor.moving
+        return self.following or not self.at_rest
+
+    @property
+    def at_rest(self) -> bool:
+        """The reference stands where it is led to, and that does not move."""
+        return not self._governor.moving
 
     @property
     def _expected(self) -> Reference:

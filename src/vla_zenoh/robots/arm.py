@@ -22,7 +22,7 @@ from vla_zenoh.guard.arm_guard import (
     Measured,
 )
 from vla_zenoh.keys import Kind
-from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
+from vla_zenoh.kinematics.so3 import Pose, pose_distance, quat_from_rotation
 from vla_zenoh.robots.driver import Measurement, RobotDriver
 from vla_zenoh.types import (
     Event,
@@ -80,6 +80,8 @@ class Arm:
         """The robot must be sent its last set-point at rest: it may have kept a velocity."""
         self.stall_s, self.stalls = 0.0, 0
         self.accepting, self.stop_latched = True, False
+        self._was_silent = False
+        """No state was heard for longer than it may be silent, in the last tick."""
         self._gripper_commands = GripperCommands(node, driver)
         self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
         self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)
@@ -130,9 +132,15 @@ class Arm:
             joints, self._gripper = measurement.joints, measurement.gripper or self._gripper
             first = self._measured is None
             self._measured = Measured(measurement.tcp, joints.position_rad, joints.velocity_rad_s)
-            if first:
+            if first or (self._was_silent and self._is_elsewhere(measurement.tcp)):
                 self.guard.anchor()
         self.publish(measurement, mono_ns)
+
+    def _is_elsewhere(self, tcp: Pose) -> bool:
+        """Whether the robot is not where it was led: another one, or it was started again."""
+        apart_m, apart_rad = pose_distance(tcp, self._reference_pose())
+        limits = self._driver.profile.limits
+        return apart_m > limits.tracking_m or apart_rad > limits.tracking_rad
 
     def _state_now(self) -> Measured:
         return self._driver.state_now() or self._measured or self._unknown
@@ -168,7 +176,8 @@ class Arm:
                     self._offer(mode, arrival, now_ns, mono_ns)
         if self._measured is not None:
             self._lead(self._measured, now_ns, mono_ns, away)
-        if away or self._silent:
+        self._was_silent = self._silent
+        if away or self._was_silent:
             self._hold.invalidate()
 
     def _arrived(self, mode: str, buffer: CallbackRing, mono_ns: int) -> list[ReceivedSample]:
@@ -209,6 +218,8 @@ class Arm:
         if self._driver.simulated:
             self._driver.move(guard.tick(mono_ns, self._driver.period_s), now_ns)
             return
+        if self._was_silent and guard.at_rest:
+            guard.hold()  # whoever is heard next is not sent where another one stood
         was_moving = guard.moving or self._resting
         self._resting = False
         if away and was_moving:
@@ -332,9 +343,15 @@ class Arm:
         if not self._hold.held or self._driver.simulated:
             return None, None
         reference = self.guard.reference
+        joints_rad = reference.position_rad if isinstance(reference, JointReference) else None
+        return self._reference_pose(), joints_rad
+
+    def _reference_pose(self) -> Pose:
+        """The TCP's pose at the set-point."""
+        reference = self.guard.reference
         if isinstance(reference, JointReference):
-            return self._driver.forward(reference.position_rad), reference.position_rad
-        return Pose(reference.position_m, reference.rotation), None
+            return self._driver.forward(reference.position_rad)
+        return Pose(reference.position_m, reference.rotation)
 
 
 class GripperCommands:

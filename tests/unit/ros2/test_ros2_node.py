@@ -32,7 +32,10 @@ POSITION_TOLERANCE_M = 1e-6
 PERIOD_S = 0.004
 BRAKED_M = 3e-5
 SPEED_M_S = 0.02
-RETURNED_RAD = 0.05
+RETURNED_RAD, ELSEWHERE_RAD = 0.05, 0.5
+JUMP_M = 0.02
+LATE = 5
+"""Set-points of a motion that are sent until the first state of a robot that came back is read."""
 BACK_M = 0.0002
 """What a test's thread that is held up between two clocks makes of a steady stream."""
 SILENCE_S = 0.3
@@ -164,6 +167,38 @@ def test_a_robot_that_returns_is_sent_no_older_set_point_than_one_where_it_is(
         assert (at.x, at.y, at.z) == pytest.approx(expected, abs=POSITION_TOLERANCE_M)
 
 
+@pytest.mark.parametrize("speed_m_s", [0.0, SPEED_M_S])
+def test_a_robot_that_returns_elsewhere_is_not_led_to_where_another_one_stood(
+    rig: Ros2Rig, speed_m_s: float
+) -> None:
+    """Its commands go on meanwhile, from a command node that has not noticed anything."""
+    robot = rig.robot
+    here_m = panda().forward(robot.joints_rad).position_m
+    y_m = panda().forward(robot.joints_rad + ELSEWHERE_RAD * np.eye(7)[0]).position_m[1]
+    rig.wait(
+        "it is where it was led",
+        lambda: np.abs(rig.newest(PoseState).position_m - here_m).max() < POSITION_TOLERANCE_M,
+    )
+    before = len(robot.goals)
+
+    def elsewhere(fields: dict[str, Any]) -> None:
+        fields["position"][0] += ELSEWHERE_RAD
+
+    with Commander(rig, speed_m_s):
+        rig.wait("goals arrive", lambda: len(robot.goals) > before + 50)
+        rig.events.clear()
+        robot.silent = True
+        rig.wait("silence", lambda: rig.happened("running->silent"))
+        time.sleep(0.1)
+        robot.alter = elsewhere
+        sent = len(robot.goals)
+        robot.silent = False
+        rig.wait("voice", lambda: rig.statuses[-1].state != "silent")
+        time.sleep(SILENCE_S)
+    late = sum(abs(goal.pose.position.y - y_m) > JUMP_M for goal in robot.goals[sent:])
+    assert late <= (LATE if speed_m_s else 0), "what stands is sent to nobody"
+
+
 def test_bytes_that_are_no_message_are_counted(rig: Ros2Rig) -> None:
     before = rig.counted("refused.malformed")
     for payload in (b"", b"\x00\x01\x00\x00\xff\xff\xff\xff", bytes(100)):
@@ -291,9 +326,10 @@ def test_depth_of_a_topic_of_its_own_goes_with_the_colours(tmp_path: Path) -> No
 
 # -- commands -------------------------------------------------------------------------------------
 class Commander:
-    """A command stream upwards at `SPEED_M_S`, from where the robot is."""
+    """A command stream upwards, from where the robot is."""
 
-    def __init__(self, rig: Ros2Rig) -> None:
+    def __init__(self, rig: Ros2Rig, speed_m_s: float = SPEED_M_S) -> None:
+        self._speed_m_s = speed_m_s
         self._stream: Publisher = rig.stream(rig.profile.keys.command_pose, f"command#{id(self)}")
         held: PoseState = rig.newest(PoseState)
         self._quat_xyzw = held.quat_xyzw
@@ -307,8 +343,8 @@ class Commander:
         # A function of time, however late this thread is woken.
         began_s, start_m = time.monotonic(), self._at_m[2]
         while not self._stop.wait(PERIOD_S):
-            self._at_m[2] = start_m + SPEED_M_S * (time.monotonic() - began_s)
-            self.put(self._at_m, SPEED_M_S)
+            self._at_m[2] = start_m + self._speed_m_s * (time.monotonic() - began_s)
+            self.put(self._at_m, self._speed_m_s)
 
     def put(self, at_m: Any, speed_m_s: float = 0.0) -> None:
         twist = np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
