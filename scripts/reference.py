@@ -341,6 +341,7 @@ REASONS = {
     "peer_timeout": "the policy server did not answer in time",
     "replayed": "a sequence number that was received before",
     "reset_refused": "`sim/reset` that cannot be executed",
+    "robot_silent": "gripper command while no state of the robot is heard",
     "robot_failed": "the robot's Python class raised",
     "schema": "another version of the wire",
     "seen": "what the model saw cannot be published",

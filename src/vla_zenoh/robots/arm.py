@@ -114,7 +114,7 @@ class Arm:
         if self.stop_latched:
             self._gripper_commands.drop()
         elif self.accepting:
-            self._gripper_commands.update(now_ns, self.guard)
+            self._gripper_commands.update(now_ns, self.guard, silent=self._was_silent)
 
     def latch_stop(self) -> None:
         """Brake, and ignore all commands until `stop_latched` is cleared."""
@@ -367,10 +367,11 @@ class GripperCommands:
         """Ignore the commands that arrived."""
         self._commands.drain()
 
-    def update(self, now_ns: int, arm: ArmGuard) -> None:
+    def update(self, now_ns: int, arm: ArmGuard, *, silent: bool = False) -> None:
         """Accept or reject the commands that arrived; `now_ns` (wall clock) says their age.
 
-        One whose writer is not that of the arm is rejected.
+        One whose writer is not that of the arm is rejected, and all to a robot that is `silent`:
+        whoever is heard next must not get them.
         """
         for arrival in self._commands.drain():
             command = self._node.decode(GripperCommand, arrival)
@@ -379,6 +380,9 @@ class GripperCommands:
             guard, why = self._guard, self._driver.profile.robot.no_gripper
             if guard is None or (why := self._driver.no_gripper):
                 self._node.reject("no_gripper", f"command/gripper: {why}")
+                continue
+            if silent:
+                self._node.reject("robot_silent", f"command/gripper: {self._driver.silent_why}")
                 continue
             try:
                 accepted = guard.accept(

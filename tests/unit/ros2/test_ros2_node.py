@@ -426,6 +426,20 @@ def test_whatever_breaks_in_the_loop_the_arm_is_braked_before_it_ends(
 
 
 # -- gripper --------------------------------------------------------------------------------------
+@whatever_the_bridge
+def test_a_gripper_command_to_a_silent_robot_is_refused(rig: Ros2Rig) -> None:
+    rig.robot.silent = True
+    rig.wait("silence", lambda: rig.statuses[-1].state == "silent")
+    before, goals = rig.counted("refused.robot_silent"), rig.counted("ros2.gripper_goals")
+    stream = rig.stream(rig.profile.keys.command_gripper, "command#late")
+    stream.publish(GripperCommand(0.0, 0.05, 10.0))
+    rig.wait("it is refused", lambda: rig.counted("refused.robot_silent") > before)
+    rig.robot.silent = False
+    rig.wait("voice", lambda: rig.statuses[-1].state == "running")
+    time.sleep(SILENCE_S)
+    assert rig.counted("ros2.gripper_goals") == goals
+
+
 def test_the_newest_gripper_goal_wins_and_never_two_run_at_once(rig: Ros2Rig) -> None:
     peer, running, most = rig.peer, set[bytes](), [0]
     widths: list[float] = []
