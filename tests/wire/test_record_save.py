@@ -208,6 +208,15 @@ def test_a_clock_that_is_set_is_told_and_nothing_is_lost(
         record.until("and the way back", lambda: len(record.entries("clock")) > 1)
         steps_s = [each["step_s"] for each in record.entries("clock")]
         assert steps_s == pytest.approx([-STEP_S, STEP_S], abs=0.1)
+        assert command_line("save", "now", profile=chain.profile_file).returncode == 0
+        (folder,) = record.saved()
+    run, states = load_run(folder), chain.profile.keys.state_joint
+    samples = run.file.entries(lambda key: key == states)
+    numbers = [each.header.seq for each in samples if each.header is not None]
+    assert numbers == sorted(numbers), "in the order in which they arrived"
+    told = " ".join(run.problems)
+    assert f"the wall clock was set by {-STEP_S:+.1f}" in told
+    assert f"the wall clock was set by {STEP_S:+.1f}" in told
 
 
 def test_a_put_without_an_author_and_a_deletion_are_logged_as_they_are(

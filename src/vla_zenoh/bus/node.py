@@ -359,11 +359,12 @@ class Node:
         handler = zenoh.handlers.Callback(handle, indirect=False)
         self._declared.append(self.session.declare_queryable(key, handler, complete=True))
 
-    def adopt_system_time(self) -> None:
-        """Adopt the system's wall clock; a step of it is counted and reported."""
+    def adopt_system_time(self) -> float:
+        """Adopt the system's wall clock; a step of it (s) is counted, reported and returned."""
         step_s = self.clock.adopt_system_time()
         if step_s:
             self.reject("clock_step", f"the wall clock was set by {step_s:+.3f} s")
+        return step_s
 
     def decode(
         self,

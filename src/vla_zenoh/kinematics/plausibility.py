@@ -103,9 +103,8 @@ def state_fault(
     if joint is not None:
         here_rad = kinematics.joints_of(joint)
         lower_rad, upper_rad = kinematics.lower_rad, kinematics.upper_rad
-        slack_rad = BEYOND * (upper_rad - lower_rad)
-        beyond = (here_rad < lower_rad - slack_rad) | (here_rad > upper_rad + slack_rad)
-        for index in np.flatnonzero(beyond).tolist():
+        away_rad = np.maximum(lower_rad - here_rad, here_rad - upper_rad)
+        for index in np.flatnonzero(away_rad > BEYOND * (upper_rad - lower_rad)).tolist():
             unit = kinematics.unit(index)
             return (
                 f"joint {kinematics.arm_joints[index]!r} is at {here_rad[index]:.4g} {unit}, and "

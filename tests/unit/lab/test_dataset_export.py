@@ -19,12 +19,14 @@ from dataset_rig import (
     DT_S,
     HEIGHT,
     HORIZON,
+    KEYS,
     LATENCY_MS,
     PROFILE,
     PROMPTS,
     WIDTH,
     ZERO_NS,
     depth_counts,
+    put,
     spec,
     steps_of,
 )
@@ -48,10 +50,11 @@ from vla_zenoh_policy_servers.state_vector import read_parts
 
 from vla_zenoh.errors import RecordingError, SpecError
 from vla_zenoh.lab.recording.run import Run, load_run, pictures
+from vla_zenoh.lab.recording.writer import CLOCK_SET, RecordingWriter
 from vla_zenoh.policy import ActionSpec, standing_step
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.load import to_yaml
-from vla_zenoh.types import JointState, NodeStatus
+from vla_zenoh.types import Event, GripperState, JointState, NodeStatus
 
 FPS, USED = 10, 2
 """Steps of a chunk until the next one takes over."""
@@ -662,6 +665,46 @@ def test_a_clock_that_was_set_back_is_named_and_no_data_set_is_made_of_it(
     assert first.startswith(("1.5 s", "1.6 s", "1.7 s"))
     with pytest.raises(RecordingError, match=r"back\.mcap: 1\.\d s after its beginning the stamps"):
         episodes_of(run)
+
+
+def test_records_stay_in_the_order_in_which_they_were_made_where_a_clock_was_set_back(
+    tmp_path: Path,
+) -> None:
+    whole = load_run(make_run(tmp_path / "whole.mcap"))
+    run = load_run(make_run(tmp_path / "back.mcap", set_back=("", 1500, 2000.0)))
+    heights_m = [entry.record.position_m[2] for entry in run.poses]
+    assert heights_m == sorted(heights_m)
+    for stream in ("poses", "tasks", "commands", "chunks"):
+        stamps, wanted = (
+            [entry.header.stamp_wall_ns for entry in getattr(each, stream)] for each in (run, whole)
+        )
+        assert stamps == wanted, stream
+    assert [each.stamp_ns for each in pictures(run.file, "front")] == [
+        each.stamp_ns for each in pictures(whole.file, "front")
+    ]
+
+
+def test_a_step_of_a_clock_that_a_node_told_of_is_named_with_its_size(tmp_path: Path) -> None:
+    why = "the wall clock was set by +2.000 s"
+    told = put(KEYS.event("camera"), Event("warning", "refusal", "clock_step", why), 10, 1)
+    path = tmp_path / "run.mcap"
+    out = RecordingWriter(path, KEYS, profile_yaml=PROFILE, base_frame="base", began_ns=ZERO_NS)
+    out.write(told)
+    out.finish()
+    assert load_run(path).problems == [f"node#1: {why}"]
+
+
+def test_times_of_reception_are_those_of_the_wall_clock_at_the_start_of_the_file(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.mcap"
+    about = {CLOCK_SET: str(3600 * 10**9)}
+    out = RecordingWriter(
+        path, KEYS, profile_yaml=PROFILE, base_frame="base", began_ns=ZERO_NS, about=about
+    )
+    out.write(put(KEYS.state_gripper, GripperState(0.05, False, False), 10, 1))
+    out.finish()
+    assert load_run(path).began_ns == ZERO_NS + 3600 * 10**9 + 11_000_000
 
 
 @pytest.mark.parametrize("by_ms", [0.0, 5.0])

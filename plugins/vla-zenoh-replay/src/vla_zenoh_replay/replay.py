@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,13 +24,12 @@ from vla_zenoh.errors import CodecError, NodeError, ProfileError, RecordingError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.reader import Recording
 from vla_zenoh.lab.recording.record_types import group_of
-from vla_zenoh.lab.recording.sample import JPEG, Sample
+from vla_zenoh.lab.recording.sample import JPEG, Sample, stamps_moved
 from vla_zenoh.lab.statistics import percentiles
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.process import realtime_thread
 from vla_zenoh.types import Header
 
-STAMP = "_ns"
 MAX_SOURCE = 128
 """Characters of a header's source."""
 
@@ -71,7 +70,7 @@ class Restamper:
             header = Header(self.moved_ns(header.stamp_wall_ns), header.seq, source)
         payload = entry.payload
         if entry.fields is not None:
-            payload = message.pack(_stamps_moved(entry.fields, self.moved_ns))
+            payload = message.pack(stamps_moved(entry.fields, self.moved_ns))
         return Sample(
             self._there.full(self._here.short(entry.key)),
             payload,
@@ -80,17 +79,6 @@ class Restamper:
             self.moved_ns(entry.received_ns),
             entry.attachment,
         )
-
-
-def _stamps_moved(fields: Mapping[str, Any], moved_ns: Callable[[int], int]) -> dict[str, Any]:
-    """Fields with moved stamps, also in the only nested map of records, the cause of a command."""
-    out = dict(fields)
-    for name, value in fields.items():
-        if name.endswith(STAMP) and type(value) is int:
-            out[name] = moved_ns(value)
-        elif name == "cause" and isinstance(value, Mapping):
-            out[name] = _stamps_moved(value, moved_ns)
-    return out
 
 
 NAME = "replay"

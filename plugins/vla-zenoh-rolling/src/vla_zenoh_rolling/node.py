@@ -34,7 +34,7 @@ from vla_zenoh.lab.rate_limit import RateLimit
 from vla_zenoh.lab.recording.recorder import COMMIT_S, SWITCH_INTERVAL_S, WRITE_S, recorded_keys
 from vla_zenoh.lab.recording.sample import Sample
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
-from vla_zenoh.lab.recording.writer import RecordingWriter
+from vla_zenoh.lab.recording.writer import CLOCK_SET, RecordingWriter
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.types import MAX_TEXT, Event, NodeStatus
 from vla_zenoh_rolling.ring import PART, Ring, RingLimits, delete_oldest_saved
@@ -86,9 +86,7 @@ class RollingRecord:
         self._ring = Ring(folder / "ring", limits)
         for part in (folder / "saved").glob(f"*{PART}"):
             shutil.rmtree(part, ignore_errors=True)
-        self._queue = SampleQueue(
-            session, max_bytes=QUEUE_BYTES, max_samples=QUEUE_SAMPLES, clock=self.node.clock
-        )
+        self._queue = SampleQueue(session, max_bytes=QUEUE_BYTES, max_samples=QUEUE_SAMPLES)
         self._writer: RecordingWriter | None = None
         self._path = Path()
         self._began_s = self._committed_s = self._try_s = 0.0
@@ -126,10 +124,8 @@ class RollingRecord:
 
     def step(self) -> None:
         """One round: the log first, then the ring, then what is to be saved."""
-        clock_step_s = self.node.clock.adopt_system_time()
-        if clock_step_s:
-            self._add("clock", step_s=round(clock_step_s, 3))
-            self.node.reject("clock_step", f"the wall clock was set by {clock_step_s:+.3f} s")
+        if step_s := self.node.adopt_system_time():
+            self._add("clock", step_s=round(step_s, 3))
         samples = self._queue.take()
         self._count(samples)
         self._note(samples)
@@ -170,6 +166,11 @@ class RollingRecord:
         )
         self._write_log()
 
+    @property
+    def _set_ns(self) -> int:
+        """By how much the wall clock was set since the clock of reception began."""
+        return self.node.clock.offset_ns - self._queue.clock.offset_ns
+
     # -- the log ------------------------------------------------------------------------------
     def _add(self, what: str, wall_ns: int | None = None, **facts: Any) -> None:
         self._log.add(what, self.node.clock.wall_ns() if wall_ns is None else wall_ns, **facts)
@@ -179,7 +180,7 @@ class RollingRecord:
         while self._queue.deletions:
             key = self._queue.deletions.popleft()
             if key in self._settings:
-                self._note_setting(Sample(key, b"", "", None, self.node.clock.wall_ns()), True)
+                self._note_setting(Sample(key, b"", "", None, self._queue.clock.wall_ns()), True)
         for sample in samples:
             if sample.key in self._settings:
                 self._note_setting(sample)
@@ -214,7 +215,7 @@ class RollingRecord:
             facts["bytes"] = len(sample.payload)
         if deleted:
             facts["deleted"] = True
-        self._add("put", sample.received_ns, **facts)
+        self._add("put", sample.received_ns + self._set_ns, **facts)
         if deleted:
             return
         if name == "save":
@@ -230,7 +231,7 @@ class RollingRecord:
         refused = event.kind == "refusal" and event.what.endswith("_refused")
         if (event.kind != "transition" and not refused) or not self._may_note(sample.key):
             return
-        self._add("command", sample.received_ns, event=event.what, why=event.why)
+        self._add("command", sample.received_ns + self._set_ns, event=event.what, why=event.why)
         if why := STOPS.get(event.what.rpartition("->")[2]):
             self._want(why)
             return
@@ -309,7 +310,11 @@ class RollingRecord:
             profile_yaml=to_yaml(self._profile),
             base_frame=self._profile.robot.base_frame,
             began_ns=self.node.clock.wall_ns(),
-            about={"profile": self._profile.name, "host": socket.gethostname()},
+            about={
+                "profile": self._profile.name,
+                "host": socket.gethostname(),
+                CLOCK_SET: str(self._set_ns),
+            },
         )
         self._began_s = self._committed_s = now_s
         if self._why:

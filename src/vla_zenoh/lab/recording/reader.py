@@ -46,7 +46,8 @@ from vla_zenoh.keys import SCHEMA, Keys
 from vla_zenoh.lab.recording import ros2_messages
 from vla_zenoh.lab.recording.record_types import RECORDS, bytes_from_json, record_from_json
 from vla_zenoh.lab.recording.sample import Sample, received_sample
-from vla_zenoh.lab.recording.writer import ABOUT, BYTES, ENDED, PROFILE_FILE
+from vla_zenoh.lab.recording.stamp_order import StampOrder
+from vla_zenoh.lab.recording.writer import ABOUT, BYTES, CLOCK_SET, ENDED, PROFILE_FILE
 from vla_zenoh.types import Header
 
 MAX_RECORD_BYTES = 256 * 1024 * 1024
@@ -88,6 +89,8 @@ class Recording:
         """Metadata from its end, once `entries` has read it; None: the file was cut off."""
         self.damage = ""
         """What could not be read, and why; empty if everything was."""
+        self.clock_steps: list[str] = []
+        """Messages about clocks that were set back; later stamps are as if they had not been."""
 
     def entries(self, wanted: Callable[[str], bool] = lambda key: True) -> Iterator[Sample]:
         """Samples in the order of reception; see `damage` for what is missing.
@@ -95,11 +98,18 @@ class Recording:
         Args:
             wanted: whether to read a key; other keys are skipped undecoded.
         """
-        self.damage, self.ended = "", None
+        order = StampOrder(self.keys)
+        self.damage, self.ended, self.clock_steps = "", None, order.steps
         missing = {"dropped": Counter[str](), "lost": Counter[str]()}
+        set_ns = 0
+        with suppress(ValueError):
+            set_ns = int(self.about.get(CLOCK_SET, "0"))
         for path in segments_of(self.path) or [self.path]:
             self.ended = None
-            yield from self._entries_of(path, wanted)
+            for entry in self._entries_of(path, wanted):
+                if set_ns:
+                    entry = replace(entry, received_ns=entry.received_ns + set_ns)
+                yield order.take(entry)
             for what, counts in missing.items():
                 counts.update(self._missing(what))
         if self.ended is not None:

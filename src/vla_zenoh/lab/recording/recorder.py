@@ -122,9 +122,7 @@ class Recorder:
     ) -> None:
         self.node = Node(name, profile, session)
         self._expressions = expressions or recorded_keys(profile.keys_of_all_parts)
-        self._queue = SampleQueue(
-            session, max_bytes=queue_bytes, max_samples=QUEUE_SAMPLES, clock=self.node.clock
-        )
+        self._queue = SampleQueue(session, max_bytes=queue_bytes, max_samples=QUEUE_SAMPLES)
         self._closing = threading.Event()
         self._shares: dict[str, Share] = {}
         self._ended: Mapping[str, Any] = {}

@@ -35,8 +35,6 @@ from vla_zenoh.types import (
 )
 
 MAX_PROBLEMS, SHOWN_KEYS = 20, 3
-CLOCK_STEP_NS = 20_000_000
-"""Stamps of one key that go back by less are of writers whose clocks differ a little."""
 _read_profile = lru_cache(maxsize=4)(partial(read_profile, where="the recorded profile"))
 PART_STREAMS = ("poses", "joints", "grippers", "commands", "joint_commands", "gripper_commands")
 """Fields of a `Run` that each part of a robot has of its own."""
@@ -96,7 +94,7 @@ class Run:
     problems: list[str] = field(default_factory=list)
     """Messages about what could not be read."""
     clock_steps: list[str] = field(default_factory=list)
-    """Messages about clocks that were set back: the order of the stamps is not that of the run."""
+    """Messages about clocks that were set back; the stamps are put in order."""
     began_ns: int = 0
     """Reception of the first sample."""
     ended_ns: int = 0
@@ -247,7 +245,7 @@ def load_run(path: Path) -> Run:
         ObjectPoses: run.objects,
         InferenceDebug: run.seen,
     }
-    newest_of, is_wanted, others = dict[str, tuple[Header, int]](), _of_interest(keys), set[str]()
+    is_wanted, others = _of_interest(keys), set[str]()
 
     def wanted(key: str) -> bool:
         if not key.startswith(f"{keys.root}/{keys.robot}/"):
@@ -257,12 +255,6 @@ def load_run(path: Path) -> Run:
     for entry in file.entries(wanted):
         run.began_ns = run.began_ns or entry.received_ns
         run.ended_ns = max(run.ended_ns, entry.received_ns)
-        if entry.header is not None:
-            before = newest_of.get(entry.key)
-            if before is not None and _is_set_back(before[0], entry.header):
-                run.clock_steps.append(_clock_step(run, keys.short(entry.key), before, entry))
-            if before is None or not _is_reordered(before[0], entry.header):
-                newest_of[entry.key] = entry.header, entry.received_ns
         if entry.kind is None:
             if entry.header is None and entry.attachment is None:
                 continue  # a setting; `tasks` has what the command node made of it
@@ -296,33 +288,14 @@ def load_run(path: Path) -> Run:
             f"it says that it is of {keys.root}/{keys.robot}, and holds nothing of that robot, but "
             f"{', '.join(sorted(others)[:SHOWN_KEYS])}: is it damaged?"
         )
+    told = [each for each in run.events if each.record.what == "clock_step"][:MAX_PROBLEMS]
+    run.problems += [f"{each.header.source}: {each.record.why}" for each in told]
     for each in lists.values():
         each.sort(key=lambda received: received.header.stamp_wall_ns)
+    run.clock_steps = file.clock_steps
     run.problems += run.clock_steps[:MAX_PROBLEMS]
     run.problems += [f"{what} ({count})" for what, count in rejected.most_common(MAX_PROBLEMS)]
     return run
-
-
-def _is_reordered(before: Header, now: Header) -> bool:
-    """Whether a sample was sent before the one that was received before it."""
-    return now.source == before.source and now.seq < before.seq
-
-
-def _is_set_back(before: Header, now: Header) -> bool:
-    back_ns = before.stamp_wall_ns - now.stamp_wall_ns
-    return back_ns > CLOCK_STEP_NS and not _is_reordered(before, now)
-
-
-def _clock_step(run: Run, key: str, before: tuple[Header, int], now: Sample) -> str:
-    assert now.header is not None
-    header, received_ns = before
-    back_ns = header.stamp_wall_ns - now.header.stamp_wall_ns + now.received_ns - received_ns
-    after_s = (now.received_ns - run.began_ns) / 1e9
-    return (
-        f"{after_s:.1f} s after its beginning the stamps on {key} go back by "
-        f"{back_ns / 1e9:.3f} s: the clock of {now.header.source!r} was set back, or another "
-        "host's differs; times across that moment are wrong"
-    )
 
 
 def _of_interest(keys: Keys) -> Callable[[str], bool]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -76,6 +76,18 @@ class Sample:
             CodecError: it cannot be decoded.
         """
         return decode_depth(self.payload, self.encoding.partition(";")[2])
+
+
+def stamps_moved(fields: Mapping[str, Any], moved_ns: Callable[[int], int]) -> dict[str, Any]:
+    """Fields with moved stamps, also in the only nested map of records, the cause of a command."""
+    return {
+        name: moved_ns(value)
+        if name.endswith("_ns") and type(value) is int
+        else stamps_moved(value, moved_ns)
+        if name == "cause" and isinstance(value, Mapping)
+        else value
+        for name, value in fields.items()
+    }
 
 
 def received_sample(

@@ -37,8 +37,9 @@ class SampleQueue:
         *,
         max_bytes: int,
         max_samples: int,
-        clock: Clock | None = None,
     ) -> None:
+        self.clock = Clock()
+        """Of the times of reception. It is never set, so that they are in the order of arrival."""
         self.dropped: Counter[str] = Counter()
         """Samples that did not fit, by key."""
         self.rejected: Counter[str] = Counter()
@@ -47,7 +48,7 @@ class SampleQueue:
         """Keys of the newest ones."""
         self.arrived: Counter[str] = Counter()
         """Samples that arrived, those that did not fit included, by key."""
-        self._session, self._clock = session, clock or Clock()
+        self._session = session
         self._max_bytes, self._max_samples = max_bytes, max_samples
         self._lock = threading.Lock()
         self._queue: deque[tuple[str, bytes, str, bytes | None, int, str]] = deque()
@@ -121,7 +122,7 @@ class SampleQueue:
                 return
             self._waiting[key] += 1
             # The stamp is taken under the lock: the queue is in the order of its stamps.
-            received_ns = self._clock.wall_ns()
+            received_ns = self.clock.wall_ns()
             self._queue.append((key, payload, encoding, attachment, received_ns, client))
             self._bytes += size
 

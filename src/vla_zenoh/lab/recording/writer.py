@@ -137,6 +137,8 @@ class CrashSafeFile:
 
 ABOUT, ENDED = "vla_zenoh", "vla_zenoh.ended"
 """Names of the MCAP metadata records at the start and end of a file."""
+CLOCK_SET = "clock_set_ns"
+"""Metadata of a file: what its times of reception lack to the wall clock at its start."""
 PROFILE_FILE = "profile.yaml"
 FULL, BYTES = "full", "bytes"
 CHUNK_BYTES = 1024 * 1024
