@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,12 @@ PLACEHOLDERS = {"panda_sim_two_hosts", "panda_sim_lab", "panda_sim_two_sites"}
 """Their addresses are to be replaced, which is advised."""
 
 
+loaded = cache(load_profile)
+
+
 @pytest.fixture(params=SHIPPED)
 def profile(request: pytest.FixtureRequest) -> Profile:
-    return load_profile(request.param)
+    return loaded(request.param)
 
 
 def sections(value: Any) -> list[BaseModel]:

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from mutants import ROOT, reviewed
@@ -56,16 +57,36 @@ def test_it_ends():
 STRICT = "src/made/amounts.py is_over: value > LIMIT -> value >= LIMIT"
 
 
-@pytest.fixture
-def made(tmp_path: Path) -> Path:
-    package = tmp_path / "src" / "made"
+def make(folder: Path) -> Path:
+    package = folder / "src" / "made"
     package.mkdir(parents=True)
     (package / "__init__.py").touch()
     (package / "amounts.py").write_text(MADE)
-    (tmp_path / "tests").mkdir()
-    (tmp_path / "tests" / "test_amounts.py").write_text(MADE_TESTS)
-    (tmp_path / "equivalent.txt").write_text("")
-    return tmp_path
+    (folder / "tests").mkdir()
+    (folder / "tests" / "test_amounts.py").write_text(MADE_TESTS)
+    (folder / "equivalent.txt").write_text("")
+    return folder
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    return make(tmp_path)
+
+
+class Tried(NamedTuple):
+    """A package all of whose mutants were tried: its folder, the status, and who caught which."""
+
+    root: Path
+    status: int
+    by: dict[str, str | None]
+
+
+@pytest.fixture(scope="module")
+def tried(tmp_path_factory: pytest.TempPathFactory) -> Tried:
+    root = make(tmp_path_factory.mktemp("tried"))
+    run = mutants(root, "--json", "--grace-s", str(GRACE_S))
+    by = {each["mutant"].split(" ", 1)[1]: each["by"] for each in json.loads(run.stdout)}
+    return Tried(root, run.returncode, by)
 
 
 def mutants(root: Path, *options: str) -> subprocess.CompletedProcess[str]:
@@ -74,32 +95,34 @@ def mutants(root: Path, *options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*program, *options], capture_output=True, text=True, timeout=LIMIT_S)
 
 
-def test_what_a_test_notices_is_caught_and_what_none_notices_survives(made: Path) -> None:
-    run = mutants(made, "--json", "--match", "LIMIT")
-    by = {each["mutant"].split(": ", 1)[1]: each["by"] for each in json.loads(run.stdout)}
-    assert by["value > LIMIT -> value >= LIMIT"] is None
-    assert by["value > LIMIT -> value <= LIMIT"].startswith("tests/test_amounts.py::test_")
-    assert run.returncode == 1, "one survived"
-    assert (made / "src" / "made" / "amounts.py").read_text() == MADE
+def test_what_a_test_notices_is_caught_and_what_none_notices_survives(tried: Tried) -> None:
+    assert tried.by["is_over: value > LIMIT -> value >= LIMIT"] is None
+    caught = tried.by["is_over: value > LIMIT -> value <= LIMIT"]
+    assert caught is not None
+    assert caught.startswith("tests/test_amounts.py::test_")
+    assert tried.status == 1, "one survived"
+    assert (tried.root / "src" / "made" / "amounts.py").read_text() == MADE
 
 
-def test_a_mutant_that_hangs_is_caught_by_its_time_limit(made: Path) -> None:
-    run = mutants(made, "--match", "number -= 1 -> pass", "--grace-s", str(GRACE_S))
-    assert "number -= 1 -> pass  by time limit" in run.stdout
-    assert run.returncode == 0
+def test_a_mutant_that_hangs_is_caught_by_its_time_limit(tried: Tried) -> None:
+    told = mutants(tried.root, "--match", "number -= 1 -> pass")
+    assert "number -= 1 -> pass  by time limit" in told.stdout
+    assert told.returncode == 0
 
 
 def test_a_constant_of_a_module_is_tried_with_the_tests_of_the_lines_that_name_it(
-    made: Path,
+    tried: Tried,
 ) -> None:
-    assert "module: 3 -> 4  by tests/test_" in mutants(made, "--match", "module: 3 -> 4").stdout
+    assert str(tried.by["module: 3 -> 4"]).startswith("tests/test_")
 
 
-def test_a_survivor_that_was_reviewed_is_no_fault_and_nothing_is_tried_twice(made: Path) -> None:
-    assert "1 tried, 0 caught, 0 equivalent, 1 missed" in mutants(made, "--match", STRICT).stdout
-    (made / "equivalent.txt").write_text(f"# Why\n{STRICT}  # whole numbers\n")
-    (made / "tests" / "test_amounts.py").unlink()
-    again = mutants(made, "--match", STRICT)
+def test_a_survivor_that_was_reviewed_is_no_fault_and_nothing_is_tried_twice(tried: Tried) -> None:
+    (tried.root / "tests" / "test_amounts.py").unlink()
+    again = mutants(tried.root, "--match", STRICT)
+    assert again.returncode == 1
+    assert "1 tried, 0 caught, 0 equivalent, 1 missed" in again.stdout
+    (tried.root / "equivalent.txt").write_text(f"# Why\n{STRICT}  # whole numbers\n")
+    again = mutants(tried.root, "--match", STRICT)
     assert again.returncode == 0
     assert "1 tried, 0 caught, 1 equivalent, 0 missed" in again.stdout
     assert "equivalent: whole numbers" in again.stdout

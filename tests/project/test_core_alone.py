@@ -8,6 +8,7 @@ import subprocess
 import sys
 import sysconfig
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from camera_rig import free_endpoint
@@ -30,44 +31,97 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-def run(alone: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
-    """Run ``vla-zenoh`` there."""
-    return subprocess.run(
-        [sys.executable, "-S", "-m", "vla_zenoh", *words],
+MANY = """
+import contextlib, io, json, os, sys
+from vla_zenoh.program.entry import main
+
+told = []
+for words, environment in json.load(sys.stdin):
+    sys.argv, out, said, code = ["vla-zenoh", *words], io.StringIO(), io.StringIO(), 0
+    os.environ.update(environment)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code or 0
+    for name in environment:
+        del os.environ[name]
+    told.append((code, out.getvalue(), said.getvalue()))
+json.dump(told, sys.stdout)
+"""
+AFTER = ((), ("--help",), ("a-word", "--an-option=1"))
+LAB = """\
+extends: panda_sim
+hosts: {here: {nodes: [router, sim, camera, command, worker, primitives]}}
+"""
+PREPARED = "openpi in an environment of its own"
+LINES = [
+    *("profile check panda_sim", "profile check fr3", "profile check panda_ros2"),
+    *("profile show fr3", "profile show panda_ros2", "doctor --json", "node --help"),
+    *("worker openpi", "up lab.yaml --dry-run"),
+]
+
+
+class Said(NamedTuple):
+    """What a command ended with."""
+
+    code: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture(scope="module")
+def said(alone: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Said]:
+    """Command line -> what became of it; one process runs them all: they need the same imports."""
+    folder = tmp_path_factory.mktemp("lab")
+    (folder / "lab.yaml").write_text(LAB, "utf-8")
+    asked = {line: (line.split(), {}) for line in LINES}
+    for command in plugins.PACKAGES:
+        for after in AFTER:
+            words = [*command.split("."), *after]
+            asked[" ".join(words)] = (words, {})
+    model = f"openpi={ROOT}/models/openpi/model.py"
+    asked[PREPARED] = (["worker", "openpi"], {plugins.OWN_ENVIRONMENT_VARIABLE: model})
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", MANY],
+        cwd=folder,
         env=alone,
+        input=json.dumps([*asked.values()]),
         capture_output=True,
         text=True,
         check=False,
     )
-
-
-def test_the_simulator_needs_no_plug_in(alone: dict[str, str]) -> None:
-    done = run(alone, "profile", "check", "panda_sim")
     assert done.returncode == 0, done.stderr
+    return dict(zip(asked, (Said(*each) for each in json.loads(done.stdout)), strict=True))
+
+
+def test_the_simulator_needs_no_plug_in(said: dict[str, Said]) -> None:
+    done = said["profile check panda_sim"]
+    assert done.code == 0, done.stderr
 
 
 @pytest.mark.parametrize(("profile", "driver"), [("fr3", "franka"), ("panda_ros2", "ros2")])
 def test_a_robot_of_a_plug_in_is_named_with_what_is_installed(
-    alone: dict[str, str], profile: str, driver: str
+    said: dict[str, Said], profile: str, driver: str
 ) -> None:
-    done = run(alone, "profile", "check", profile)
-    assert done.returncode == 1
+    done = said[f"profile check {profile}"]
+    assert done.code == 1
     assert f"robot.driver: no robot driver '{driver}' is installed" in done.stderr
     assert "Installed: arm, sim." in done.stderr
-    assert run(alone, "profile", "show", profile).returncode == 0
+    assert said[f"profile show {profile}"].code == 0
 
 
-def test_the_doctor_needs_no_extra_and_lists_the_plug_ins(alone: dict[str, str]) -> None:
-    done = run(alone, "doctor", "--json")
+def test_the_doctor_needs_no_extra_and_lists_the_plug_ins(said: dict[str, Said]) -> None:
+    done = said["doctor --json"]
     assert "cryptography" not in done.stderr
     found = {each["name"]: each["found"] for each in json.loads(done.stdout)}
     assert found["plug-ins: robot drivers"] == "arm, sim"
     assert found["plug-ins: benchmarks"] == "none"
 
 
-def test_its_commands_are_listed_and_those_of_plug_ins_are_not(alone: dict[str, str]) -> None:
-    done = run(alone, "node", "--help")
-    assert done.returncode == 0, done.stderr
+def test_its_commands_are_listed_and_those_of_plug_ins_are_not(said: dict[str, Said]) -> None:
+    done = said["node --help"]
+    assert done.code == 0, done.stderr
     assert "  camera " in done.stdout
     assert "  rolling " not in done.stdout
 
@@ -77,73 +131,47 @@ INSTALL = "install it with: pip install -c constraints.txt . './plugins/vla-zeno
 
 
 def test_a_model_whose_header_names_a_package_that_is_missing_says_how_to_install_it(
-    alone: dict[str, str],
+    said: dict[str, Said],
 ) -> None:
-    done = run(alone, "worker", "openpi")
-    assert done.returncode == 1
+    done = said["worker openpi"]
+    assert done.code == 1
     assert f"{SHARED} is not installed; {INSTALL}" in done.stderr
-    prepared = {**alone, plugins.OWN_ENVIRONMENT_VARIABLE: f"openpi={ROOT}/models/openpi/model.py"}
-    done = run(prepared, "worker", "openpi")
-    assert "its environment lacks vla-zenoh-policy-servers" in done.stderr
-    assert f"needs {SHARED}; {INSTALL}" in done.stderr
+    assert "its environment lacks vla-zenoh-policy-servers" in said[PREPARED].stderr
+    assert f"needs {SHARED}; {INSTALL}" in said[PREPARED].stderr
 
 
-def test_the_models_of_the_demo_need_no_package(alone: dict[str, str]) -> None:
-    for name in ("scripted", "brick"):
-        done = run(alone, "check", name)
-        assert done.returncode == 0, done.stderr
-
-
-MANY = """
-import contextlib, io, json, sys
-from vla_zenoh.program.entry import main
-
-told = []
-for words in json.load(sys.stdin):
-    sys.argv, said, code = ["vla-zenoh", *words], io.StringIO(), 0
-    with contextlib.redirect_stderr(said):
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code
-    told.append((code, said.getvalue()))
-json.dump(told, sys.stdout)
-"""
-AFTER = ((), ("--help",), ("a-word", "--an-option=1"))
-
-
-def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
-    alone: dict[str, str],
-) -> None:
-    """One process runs them all: each would spend its time on the same imports."""
-    asked = [(command, after) for command in plugins.PACKAGES for after in AFTER]
-    words = [(*command.split("."), *after) for command, after in asked]
+@pytest.mark.parametrize("name", ["scripted", "brick"])
+def test_the_models_of_the_demo_need_no_package(alone: dict[str, str], name: str) -> None:
+    """`check` ends its process itself."""
     done = subprocess.run(
-        [sys.executable, "-S", "-c", MANY],
+        [sys.executable, "-S", "-m", "vla_zenoh", "check", name],
         env=alone,
-        input=json.dumps(words),
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    for (command, after), (code, said) in zip(asked, json.loads(done.stdout), strict=True):
-        assert code == 1, (command, after, said)
-        package = plugins.PACKAGES[command]
-        assert f"needs the package {package}; install it with: pip install" in said, after
-        folders = [*plugins.needed_by(package), package]
-        paths = " ".join(f"'./plugins/{each}'" for each in folders)
-        assert f" . {paths} in a checkout" in said, (command, after)
+
+
+def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
+    said: dict[str, Said],
+) -> None:
+    for command, package in plugins.PACKAGES.items():
+        for after in AFTER:
+            line = " ".join([*command.split("."), *after])
+            code, _, told = said[line]
+            assert code == 1, (line, told)
+            assert f"needs the package {package}; install it with: pip install" in told, line
+            folders = [*plugins.needed_by(package), package]
+            paths = " ".join(f"'./plugins/{each}'" for each in folders)
+            assert f" . {paths} in a checkout" in told, line
 
 
 def test_up_says_at_its_start_that_a_node_of_its_host_needs_a_package(
-    alone: dict[str, str], tmp_path: Path
+    said: dict[str, Said],
 ) -> None:
-    profile = tmp_path / "lab.yaml"
-    nodes = "[router, sim, camera, command, worker, primitives]"
-    profile.write_text(f"extends: panda_sim\nhosts: {{here: {{nodes: {nodes}}}}}\n", "utf-8")
-    done = run(alone, "up", str(profile), "--dry-run")
-    assert done.returncode == 1
+    done = said["up lab.yaml --dry-run"]
+    assert done.code == 1
     assert "hosts.here.nodes has primitives: `vla-zenoh node primitives` needs" in done.stderr
 
 
@@ -153,7 +181,7 @@ def test_up_runs_without_a_rolling_record_and_names_its_package(
 ) -> None:
     router = free_endpoint()
     words = ["up", "panda_sim", "--dry-run", "--connect", router, "--listen", router]
-    said = []
+    lines = []
     with subprocess.Popen(
         [sys.executable, "-S", "-m", "vla_zenoh", *words, "--log-dir", str(tmp_path)],
         env=alone,
@@ -162,9 +190,9 @@ def test_up_runs_without_a_rolling_record_and_names_its_package(
     ) as lab:
         assert lab.stdout is not None
         for line in lab.stdout:
-            said.append(line)
+            lines.append(line)
             if "watch: " in line:
                 lab.terminate()
-    (sentence,) = [line for line in said if "rolling record" in line]
+    (sentence,) = [line for line in lines if "rolling record" in line]
     assert "`vla-zenoh node rolling` needs the package vla-zenoh-rolling; install" in sentence
-    assert "all nodes have stopped" in said[-1]
+    assert "all nodes have stopped" in lines[-1]

@@ -6,6 +6,7 @@ import ast
 import contextlib
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -27,12 +28,17 @@ TRAINING = {"training", "measure.py"}
 RAW = re.compile(r"https?://|errors\.pydantic|Input should|unable to parse|type=")
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
 def broad_handlers() -> Iterator[tuple[str, ast.ExceptHandler]]:
     """``except Exception as error`` and broader, with their file and line."""
     for path in SOURCES:
         if TRAINING & set(path.parts):
             continue
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if not isinstance(node, ast.ExceptHandler) or node.name is None:
                 continue
             caught = ast.unparse(node.type) if node.type else ""
@@ -45,7 +51,7 @@ def test_faults_of_pydantic_are_put_into_words_in_one_place() -> None:
         f"{path.relative_to(ROOT)}:{node.lineno}"
         for path in SOURCES
         if path != Path(errors.__file__)
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.FormattedValue)
         and isinstance(node.value, ast.Subscript)
         and ast.unparse(node.value.slice) == "'msg'"

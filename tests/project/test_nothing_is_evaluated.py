@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -63,11 +64,16 @@ def fault(node: ast.AST) -> str:
     return ""
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"))
+
+
 def found(check: Callable[[ast.AST], object]) -> list[str]:
     """``file:line: what`` of every node in the sources that `check` says something of."""
     out: list[str] = []
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        for node in ast.walk(parsed(path)):
             said = check(node)
             if said:
                 out.append(f"{path}:{getattr(node, 'lineno', 0)}: {said}")

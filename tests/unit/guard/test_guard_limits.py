@@ -7,6 +7,7 @@ and heaps them.
 from __future__ import annotations
 
 import random
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from guard_rig import (
     STREAM_S,
     Link,
     Mode,
+    Trace,
     drive,
     ill,
     limits_of,
@@ -46,15 +48,19 @@ the TCP and norm of its rotation (FR3), and per joint (Panda). Source: frankarob
 "Robot and interface specifications"."""
 
 
+@cache
+def over_an_ill_link(mode: Mode, seed: int, tick_s: float) -> Trace:
+    """Driven once for all that is asked of it."""
+    return drive(mode, seed, ill(random.Random(seed)), tick_s=tick_s, duration_s=DURATION_S)
+
+
 @pytest.mark.parametrize("tick_s", TICKS_S)
 @pytest.mark.parametrize("mode", ["pose", "joint"])
 @pytest.mark.parametrize("seed", range(6))
 def test_over_whatever_link_every_difference_keeps_to_the_margin(
     mode: Mode, seed: int, tick_s: float
 ) -> None:
-    link = ill(random.Random(seed))
-    trace = drive(mode, seed, link, tick_s=tick_s, duration_s=DURATION_S)
-    velocity, acceleration, jerk = ratios(mode, trace)
+    velocity, acceleration, jerk = ratios(mode, over_an_ill_link(mode, seed, tick_s))
     assert velocity <= BRAKE_MARGIN * MOVING
     assert acceleration <= BRAKE_MARGIN * MOVING
     assert jerk <= BRAKE_MARGIN * TURNED
@@ -63,7 +69,7 @@ def test_over_whatever_link_every_difference_keeps_to_the_margin(
 @pytest.mark.parametrize("tick_s", TICKS_S)
 @pytest.mark.parametrize("mode", ["pose", "joint"])
 def test_what_is_told_beside_a_position_is_what_the_positions_do(mode: Mode, tick_s: float) -> None:
-    trace = drive(mode, 3, ill(random.Random(3)), tick_s=tick_s, duration_s=DURATION_S)
+    trace = over_an_ill_link(mode, 3, tick_s)
     velocity, acceleration, _ = trace.differences()
     limits = limits_of(mode)
     mean = (trace.rate[1:] + trace.rate[:-1]) / 2
@@ -85,7 +91,7 @@ def test_a_healthy_stream_has_no_more_than_its_own_limits(mode: Mode) -> None:
 @pytest.mark.parametrize("mode", ["pose", "joint"])
 @pytest.mark.parametrize("seed", range(3))
 def test_at_a_thousand_hertz_no_limit_of_a_real_franka_is_met(mode: Mode, seed: int) -> None:
-    trace = drive(mode, seed, ill(random.Random(seed)), tick_s=0.001, duration_s=DURATION_S)
+    trace = over_an_ill_link(mode, seed, 0.001)
     for values, limit in zip(trace.differences(), FR3[mode], strict=True):
         assert (magnitudes(mode, values) < limit).all()
 

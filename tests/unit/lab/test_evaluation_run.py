@@ -21,7 +21,7 @@ from vla_zenoh.keys import Keys
 from vla_zenoh.lab.evaluation.evaluate import evaluate
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.evaluation.report import page
-from vla_zenoh.lab.evaluation.result import TASKS, PlotTrace
+from vla_zenoh.lab.evaluation.result import TASKS, Evaluation, PlotTrace
 from vla_zenoh.lab.evaluation.timelines import unbroken
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.reader import open_recording
@@ -159,8 +159,13 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_stages_are_measured_and_add_up(recording: Path) -> None:
-    latency = evaluate_loaded(load_run(recording)).latency()
+@pytest.fixture(scope="module")
+def evaluated(recording: Path) -> Evaluation:
+    return evaluate_loaded(load_run(recording))
+
+
+def test_stages_are_measured_and_add_up(evaluated: Evaluation) -> None:
+    latency = evaluated.latency()
     assert latency["outbound"].mean == CAMERA_MS
     assert latency["inference"].max == INFERENCE_MS
     assert latency["worker_to_command"].min == RECEIVED_MS
@@ -170,8 +175,8 @@ def test_stages_are_measured_and_add_up(recording: Path) -> None:
     assert latency["inbound"].p50 == CHUNK_NS / 1e6 - CAMERA_MS - INFERENCE_MS
 
 
-def test_ways_tracking_jerk_and_rest_are_those_that_were_put_in(recording: Path) -> None:
-    run = evaluate_loaded(load_run(recording))
+def test_ways_tracking_jerk_and_rest_are_those_that_were_put_in(evaluated: Evaluation) -> None:
+    run = evaluated
     way_m = SPEED_M_S * SECONDS / 2
     assert run.name == "lab"
     assert run.path_m == pytest.approx(way_m)
@@ -183,16 +188,16 @@ def test_ways_tracking_jerk_and_rest_are_those_that_were_put_in(recording: Path)
 
 
 def test_requests_are_those_of_the_obeyed_worker_and_their_success_is_counted(
-    recording: Path,
+    evaluated: Evaluation,
 ) -> None:
-    run = evaluate_loaded(load_run(recording))
+    run = evaluated
     asked = SECONDS * 1_000_000_000 // CHUNK_NS
     assert run.requests == asked
     assert run.executed == asked - 1, "the last chunk came too late for any command"
 
 
 def test_chunks_that_were_executed_without_the_motion_asked_for_are_named(
-    recording: Path, tmp_path: Path
+    recording: Path, evaluated: Evaluation, tmp_path: Path
 ) -> None:
     """A recording that was begun when the arm stood again: everything was executed in it."""
     path, since_ns = tmp_path / "late.mcap", ZERO_NS + SECONDS * 500_000_000
@@ -211,7 +216,7 @@ def test_chunks_that_were_executed_without_the_motion_asked_for_are_named(
     problems = " ".join(run.problems)
     assert "the recording began after the arm had begun to move" in problems
     assert "reached 0.0000 m: its chunks were executed, and the arm did not do it" in problems
-    whole = evaluate_loaded(load_run(recording))
+    whole = evaluated
     assert "began after" not in " ".join(whole.problems)
 
 
@@ -263,8 +268,8 @@ def test_motion_of_a_worker_that_reads_no_prompt_is_no_answer_to_the_prompt(
     assert run.prompts == ["HARD: go up"]
 
 
-def test_seams_tell_how_far_the_goal_went(recording: Path) -> None:
-    run = evaluate_loaded(load_run(recording))
+def test_seams_tell_how_far_the_goal_went(evaluated: Evaluation) -> None:
+    run = evaluated
     assert len(run.seam_goal_mm) == SECONDS * 5 - 2
     assert run.seam_goal_mm.max() == pytest.approx(10.0 - SPEED_M_S * TICK_NS / 1e6, abs=0.01)
     assert run.seam_velocity_mm_s.max() == pytest.approx(50.0, abs=0.01), "it stops at once"
@@ -302,17 +307,17 @@ def test_commands_that_are_rarer_at_rest_change_neither_jerk_nor_seams(tmp_path:
     assert rarely.jerk.mean() == pytest.approx(often.jerk.mean(), rel=0.02)
 
 
-def test_refusals_are_those_of_the_recorded_time(recording: Path) -> None:
-    run = evaluate_loaded(load_run(recording))
+def test_refusals_are_those_of_the_recorded_time(evaluated: Evaluation) -> None:
+    run = evaluated
     assert (run.refusals, run.skipped) == ({"stale": SECONDS}, {"superseded": SECONDS})
 
 
-def test_the_drift_off_the_asked_axis_and_the_gripper_are_told(recording: Path) -> None:
-    (segment,) = evaluate_loaded(load_run(recording)).segments
+def test_the_drift_off_the_asked_axis_and_the_gripper_are_told(evaluated: Evaluation) -> None:
+    (segment,) = evaluated.segments
     assert segment.along_m == pytest.approx(SPEED_M_S * SECONDS / 2)
     assert segment.drift_m == pytest.approx(0.0, abs=1e-12)
     assert segment.width_m == (0.08, 0.03)
-    assert evaluate_loaded(load_run(recording)).row()["gripper_travel_m"] == pytest.approx(0.05)
+    assert evaluated.row()["gripper_travel_m"] == pytest.approx(0.05)
 
 
 def test_the_strip_shows_the_pictures_that_chunks_were_made_of(recording: Path) -> None:
@@ -322,14 +327,14 @@ def test_the_strip_shows_the_pictures_that_chunks_were_made_of(recording: Path) 
 
 
 def test_a_recording_that_was_cut_off_is_evaluated_up_to_there(
-    recording: Path, tmp_path: Path
+    recording: Path, evaluated: Evaluation, tmp_path: Path
 ) -> None:
     cut = tmp_path / "cut.mcap"
     whole = recording.read_bytes()
     cut.write_bytes(whole[: len(whole) // 2])
     run = evaluate_loaded(load_run(cut))
     assert any("cut off or damaged after" in problem for problem in run.problems)
-    assert 0 < run.requests <= evaluate_loaded(load_run(recording)).requests
+    assert 0 < run.requests <= evaluated.requests
 
 
 def test_a_run_that_moves_to_another_time_and_robot_keeps_its_latencies(recording: Path) -> None:
@@ -398,18 +403,25 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_run_says_where_it_comes_from(judged: Path) -> None:
-    about = evaluate_loaded(load_run(judged)).about
+@pytest.fixture(scope="module")
+def judged_run(judged: Path) -> Evaluation:
+    return evaluate_loaded(load_run(judged))
+
+
+def test_a_run_says_where_it_comes_from(judged_run: Evaluation) -> None:
+    about = judged_run.about
     assert about.items() >= PROVENANCE.items()
     assert about["seed"] == "7"
     assert about["model"] == "scripted"
     assert about["recorded"].startswith("2023-11-1")
 
 
-def test_the_verdicts_on_its_tasks_are_those_of_the_judge(judged: Path, recording: Path) -> None:
-    (verdict,) = evaluate_loaded(load_run(judged)).verdicts
+def test_the_verdicts_on_its_tasks_are_those_of_the_judge(
+    judged_run: Evaluation, evaluated: Evaluation
+) -> None:
+    (verdict,) = judged_run.verdicts
     assert (verdict.prompt, verdict.success, verdict.said) == tuple(TASK.values())
-    assert evaluate_loaded(load_run(recording)).verdicts == []
+    assert evaluated.verdicts == []
 
 
 def test_a_page_of_one_run_shows_provenance_verdict_curves_and_video(judged: Path) -> None:
@@ -434,8 +446,8 @@ def test_a_run_is_named_after_its_folder_from_within_it_too(
     assert "<h1>Evaluation of lab</h1>" in page([run], {})
 
 
-def test_a_page_counts_only_runs(judged: Path, recording: Path) -> None:
-    runs = [evaluate_loaded(load_run(judged)), evaluate_loaded(load_run(recording))]
+def test_a_page_counts_only_runs(judged_run: Evaluation, evaluated: Evaluation) -> None:
+    runs = [judged_run, evaluated]
     text = page(runs, {})
     assert "<h1>Evaluation of 2 runs</h1>" in text
     assert text.count("<section id=") == len(runs)

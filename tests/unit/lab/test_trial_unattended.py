@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from vla_zenoh_nights import runner
 from vla_zenoh_nights.judge import Frame, JudgedEpisode, make_judge
 from vla_zenoh_nights.operator import film_strip, strip_path
 from vla_zenoh_nights.plan import (
@@ -243,7 +244,10 @@ def test_an_answer_that_is_none_is_no_verdict(
             judge(seen)
 
 
-def test_a_webhook_is_told_in_order_and_a_dead_one_warns() -> None:
+def test_a_webhook_is_told_in_order_and_a_dead_one_warns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(runner, "BACK_OFF_S", 0.01)
     warnings: list[str] = []
     with a_peer({}) as peer:
         hook = Webhook(peer.url, warnings.append)
