@@ -120,7 +120,7 @@ def test_addresses_and_host_names_are_taken(text: str) -> None:
     assert network_address(text) == text
 
 
-@pytest.mark.parametrize("address", ADDRESSES)
+@pytest.mark.parametrize("address", ["10.0.0.300", "a b"])
 @pytest.mark.parametrize("option", ["--at robot={}", "--address {}"])
 def test_no_certificate_is_made_for_what_is_no_address(
     capsys: pytest.CaptureFixture[str], monkeypatch: Any, tmp_path: Path, option: str, address: str

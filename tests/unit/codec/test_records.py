@@ -98,7 +98,8 @@ def test_every_field_of_a_record_is_drawn_at_random(kind: type) -> None:
     @settings(NOTHING_TAKEN, derandomize=True, database=None)
     def draw(record: Any) -> None:
         for name, known in values.items():
-            known.add(repr(getattr(record, name)))
+            if len(known) < 2:
+                known.add(repr(getattr(record, name)))
 
     draw()
     same = [name for name, known in values.items() if len(known) == 1]
@@ -108,25 +109,14 @@ def test_every_field_of_a_record_is_drawn_at_random(kind: type) -> None:
 @by_kind
 @given(data=st.data())
 @NOTHING_TAKEN
-def test_a_record_comes_back_as_it_was(kind: type, data: st.DataObject) -> None:
+def test_a_record_is_written_as_a_map_of_its_fields_comes_back_as_it_was_and_stays_so(
+    kind: type, data: st.DataObject
+) -> None:
     record = data.draw(RECORDS[kind])
-    back = records.decode(kind, records.encode(record))
+    payload = records.encode(record)
+    assert payload == msgpack.packb(as_map(record))
+    back = records.decode(kind, payload)
     assert back == record if kind is ModelSpec else near(record, back)
-
-
-@by_kind
-@given(data=st.data())
-@NOTHING_TAKEN
-def test_a_record_is_written_as_a_map_of_its_fields(kind: type, data: st.DataObject) -> None:
-    record = data.draw(RECORDS[kind])
-    assert records.encode(record) == msgpack.packb(as_map(record))
-
-
-@by_kind
-@given(data=st.data())
-@NOTHING_TAKEN
-def test_what_is_read_cannot_be_written_to(kind: type, data: st.DataObject) -> None:
-    back = records.decode(kind, records.encode(data.draw(RECORDS[kind])))
     fields = list(type(back).model_fields if kind is ModelSpec else back.__dataclass_fields__)
     for name in fields:
         value = getattr(back, name)
@@ -147,18 +137,13 @@ def test_arbitrary_bytes_are_refused_or_read(kind: type, payload: bytes) -> None
 @by_kind
 @given(data=st.data())
 @NOTHING_TAKEN
-def test_a_truncated_record_is_refused(kind: type, data: st.DataObject) -> None:
-    payload = records.encode(data.draw(RECORDS[kind]))
+def test_a_truncated_record_is_refused_and_one_with_flipped_bits_or_read(
+    kind: type, data: st.DataObject
+) -> None:
+    payload = bytearray(records.encode(data.draw(RECORDS[kind])))
     cut = data.draw(st.integers(0, len(payload) - 1))
     with pytest.raises(CodecError):
-        records.decode(kind, payload[:cut])
-
-
-@by_kind
-@given(data=st.data())
-@NOTHING_TAKEN
-def test_flipped_bits_are_refused_or_read(kind: type, data: st.DataObject) -> None:
-    payload = bytearray(records.encode(data.draw(RECORDS[kind])))
+        records.decode(kind, bytes(payload[:cut]))
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] ^= 1 << data.draw(st.integers(0, 7))
     assert decoded_or_refused(kind, bytes(payload))

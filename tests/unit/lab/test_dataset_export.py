@@ -767,16 +767,15 @@ def read_back(path: Path) -> tuple[Any, list[str]]:
     return (counted, frames, profile, dict(run.picture_counts)), run.problems
 
 
-@pytest.mark.parametrize("begin", range(20))
 def test_a_byte_that_flipped_anywhere_changes_nothing_or_is_named(
-    begin: int, run_file: Path, tmp_path: Path
+    run_file: Path, tmp_path: Path
 ) -> None:
     """Positions all over the file, most of them where its index and facts are."""
     data, path = run_file.read_bytes(), tmp_path / "flipped.mcap"
     whole, _ = read_back(run_file)
     facts = [*range(1200), *range(len(data) - 6000, len(data))]
-    random = np.random.default_rng(begin)
-    for at in [*random.choice(facts, 6), *random.integers(0, len(data), 3)]:
+    random = np.random.default_rng(0)
+    for at in [*random.choice(facts, 40), *random.integers(0, len(data), 20)]:
         flipped = bytearray(data)
         flipped[at] ^= 1 << int(random.integers(8))
         path.write_bytes(flipped)

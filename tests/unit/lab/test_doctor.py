@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from peer_rig import free_port
 from typer.testing import CliRunner, Result
 from vla_zenoh_franka.check import network_card
 from vla_zenoh_franka.plugin import FrankaOptions
@@ -206,11 +207,6 @@ def refuse(_endpoint: str) -> str:
 
 def accept(_endpoint: str) -> str:
     return ""
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
 
 
 def test_a_free_port_is_well_where_the_router_is_to_run_and_a_warning_elsewhere() -> None:

@@ -29,10 +29,7 @@ from vla_zenoh.profile import (
     Profile,
     load_profile,
     override,
-    read_profile,
-    to_yaml,
 )
-from vla_zenoh.resources import names
 from vla_zenoh.types import (
     LATENCY_STAGES,
     ActionChunk,
@@ -390,12 +387,6 @@ def test_pictures_and_the_models_view_are_there(shown: Shown) -> None:
     (answer,) = shown.texts("seen/scripted/answer")
     assert "30.0 ms, 3 steps" in answer
     assert '{"a": 1.5}' in answer
-
-
-@pytest.mark.parametrize("name", names("profiles"))
-def test_the_profile_in_a_recording_is_read_as_it_was(name: str) -> None:
-    profile = load_profile(name)
-    assert read_profile(to_yaml(profile), "run.mcap") == profile
 
 
 # -- what cannot be shown -------------------------------------------------------------------------

@@ -15,13 +15,12 @@ from vla_zenoh import resources
 from vla_zenoh.types import JointCommand, JointState
 
 TURN = 2 * math.pi
-SPEED_RAD_S, RAMP_S = 0.6, 0.5
+SPEED_RAD_S, RAMP_S = 0.9, 0.5
 NEAR_RAD = 0.02
 REPORTED: dict[str, Callable[[float], float]] = {
     "from -pi to pi": lambda at: (at + math.pi) % TURN - math.pi,
     "from 0 to 2 pi": lambda at: at % TURN,
-    "counted": lambda at: at,
-    "counted from elsewhere": lambda at: at + 7 * TURN,
+    "counted": lambda at: at + 7 * TURN,
 }
 
 
