@@ -161,13 +161,11 @@ def chunk_poses(spec: ActionSpec, steps: Steps, start: Pose) -> list[Pose]:
     return poses
 
 
-def as_deltas(
-    spec: ActionSpec, steps: Steps, endless: NDArray[np.bool_] | bool = False
-) -> tuple[ActionSpec, FloatArray]:
+def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
     """The same chunk of one arm as deltas, each added to the step before, with the spec of them.
 
     A chunk of deltas on the previous step, or of absolute poses, is returned as it is, but with
-    quaternions in place of 6D rotations. Joints (n,) that are `endless` go the shortest way.
+    quaternions in place of 6D rotations.
     """
     spec, steps = with_quaternions(spec, np.asarray(steps, np.float64))
     size = spec.arm_size
@@ -178,7 +176,6 @@ def as_deltas(
         return spec, steps
     if spec.space == "joint":
         ways = np.diff(steps[:, :size], axis=0, prepend=np.zeros((1, size)))
-        ways = np.where(endless, nearest_turn(ways, np.zeros(size)), ways)
         changed = {"relative_to": "previous"}
         return spec.model_copy(update=changed), np.concatenate([ways, steps[:, size:]], axis=1)
     origin = Pose(np.zeros(3), np.eye(3))

@@ -23,6 +23,7 @@ from vla_zenoh.control.actions import as_deltas
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.recording.run import RecordedSample, Run, Span, is_within, newest
 from vla_zenoh.policy import ActionSpec, ModelSpec, standing_step
+from vla_zenoh.policy.meaning import wrapped
 from vla_zenoh.policy.plan_clock import idle_time
 from vla_zenoh.policy.spec import PERSON
 from vla_zenoh.types import Header
@@ -105,9 +106,9 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
         RecordingError: a chunk's spec is not in the recording, a person's motion cannot be told in
             the numbers of the model's spec, or a clock was set back.
     """
-    if run.clock_steps:
+    if steps := run.file.clock_steps:
         raise RecordingError(
-            f"{run.path}: {run.clock_steps[0]}. Which state belongs to which action is unknown; "
+            f"{run.path}: {steps[0]}. Which state belongs to which action is unknown; "
             "leave this recording out, and synchronise the clocks (`vla-zenoh doctor`) before the "
             "next one"
         )
@@ -261,13 +262,24 @@ def _as_deltas(
 ) -> tuple[ActionSpec, NDArray[np.float64]]:
     """`as_deltas` of every part."""
     if not spec.parts:
-        return as_deltas(spec, steps, endless_joints(run, spec, ""))
+        return _deltas(run, spec, steps, "")
     own = {
-        part: as_deltas(action, steps[:, spec.columns(part)], endless_joints(run, action, part))
-        for part, action in ((each.part, each.action) for each in spec.parts)
+        each.part: _deltas(run, each.action, steps[:, spec.columns(each.part)], each.part)
+        for each in spec.parts
     }
     action = ActionSpec.of_parts({part: meant for part, (meant, _) in own.items()})
     return action, np.concatenate([rows for _, rows in own.values()], axis=1)
+
+
+def _deltas(
+    run: Run, spec: ActionSpec, steps: NDArray[np.float32], part: str
+) -> tuple[ActionSpec, NDArray[np.float64]]:
+    """`as_deltas` of one part; joints without an end go the shortest way, as they are moved."""
+    action, rows = as_deltas(spec, steps)
+    if spec.relative_to == "start":
+        endless = np.flatnonzero(endless_joints(run, spec, part))
+        rows[:, endless] = wrapped(rows[:, endless])
+    return action, rows
 
 
 class StepClock:

@@ -6,6 +6,7 @@ import datetime as dt
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -157,8 +158,11 @@ def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
     _segments(out, run, causes, measured)
     if causes and causes[0][0].received_ns < run.began_ns:
         out.problems.append(
-            "the recording began after the arm had begun to move: the motion before is not in it"
+            "the recording began after the arm had begun to move: the motion before is not in it, "
+            "and how much of what was asked for was done before is not known"
         )
+        for first in out.segments[:1]:
+            out.segments[0] = replace(first, asked_m=None, asked_rad=None)
     out.problems += [found.shortfall for found in out.segments if found.shortfall]
     out.about, out.verdicts = provenance(run), verdicts(run)
     if pictures:

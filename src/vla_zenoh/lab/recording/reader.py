@@ -99,7 +99,8 @@ class Recording:
             wanted: whether to read a key; other keys are skipped undecoded.
         """
         order = StampOrder(self.keys)
-        self.damage, self.ended, self.clock_steps = "", None, order.steps
+        self.damage, self.ended = "", None
+        self.clock_steps = self.clock_steps or order.steps
         missing = {"dropped": Counter[str](), "lost": Counter[str]()}
         set_ns = 0
         with suppress(ValueError):

@@ -93,8 +93,6 @@ class Run:
     """Cameras with depth."""
     problems: list[str] = field(default_factory=list)
     """Messages about what could not be read."""
-    clock_steps: list[str] = field(default_factory=list)
-    """Messages about clocks that were set back; the stamps are put in order."""
     began_ns: int = 0
     """Reception of the first sample."""
     ended_ns: int = 0
@@ -288,12 +286,14 @@ def load_run(path: Path) -> Run:
             f"it says that it is of {keys.root}/{keys.robot}, and holds nothing of that robot, but "
             f"{', '.join(sorted(others)[:SHOWN_KEYS])}: is it damaged?"
         )
-    told = [each for each in run.events if each.record.what == "clock_step"][:MAX_PROBLEMS]
-    run.problems += [f"{each.header.source}: {each.record.why}" for each in told]
+    run.problems += [
+        f"{told.header.source}: {told.record.why}"
+        for told in run.events
+        if told.record.what == "clock_step"
+    ]
     for each in lists.values():
         each.sort(key=lambda received: received.header.stamp_wall_ns)
-    run.clock_steps = file.clock_steps
-    run.problems += run.clock_steps[:MAX_PROBLEMS]
+    run.problems += file.clock_steps[:MAX_PROBLEMS]
     run.problems += [f"{what} ({count})" for what, count in rejected.most_common(MAX_PROBLEMS)]
     return run
 
