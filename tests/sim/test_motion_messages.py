@@ -274,8 +274,6 @@ NO_ROTATION = {"quat_xyzw": np.array([0.9, 0.0, 0.0, 0.0])}
         (ActionChunk, spoilt(ActionChunk, "steps"), STARVED),
         (PoseState, spoilt(PoseState, "position_m"), LOST),
         (GripperState, spoilt(GripperState, "width_m"), LOST),
-        (PoseCommand, spoilt(PoseCommand, "position_m"), SILENT),
-        (PoseState, changed(PoseState, **NO_ROTATION), LOST),
         (PoseCommand, changed(PoseCommand, **NO_ROTATION), SILENT),
     ],
 )
