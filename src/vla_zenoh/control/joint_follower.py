@@ -58,6 +58,8 @@ ACCELERATION_HALVINGS = 8
 NEAR_SHARE, FAR_SHARE = 0.7, 0.1
 """Part of the joints' acceleration and jerk available for a distance constraint: they follow the
 pose besides. And for the first test whether a constraint is far away."""
+ROUNDS = 3
+"""Times that the constraints are gone through."""
 ELBOW_COST = 1e-2
 """Cost of a joint's motion beside that of the TCP's."""
 BACK_JERK = 0.4
@@ -266,16 +268,23 @@ class JointFollower:
         # A conservative test first, for all constraints at once.
         fastest = np.maximum(rows @ reached, 0.0) + most * most / jerk
         far = left_m > fastest * (dt_s + 2 * most / jerk + fastest / (2 * most))
+        near = np.flatnonzero(~far & rows.any(axis=1)).tolist()
+        if not near:
+            return reached, hits
         before = rows @ now.velocity_rad_s
         metric = jacobian.T @ jacobian + ELBOW_COST * np.eye(jacobian.shape[1])
-        for index in np.flatnonzero(~far).tolist():
+        ways = np.linalg.solve(metric, rows[near].T)
+        ways /= (rows[near].T * ways).sum(axis=0)
+        # Joints that brake for one constraint have less for others, unless these lie on its way.
+        others = 1.0 - np.clip(rows[near] @ ways, 0.0, 1.0)
+        others[rows[near] @ reached <= 0] = 0.0
+        efforts = np.maximum(np.abs(ways) @ (np.eye(len(near)) + others), ROUNDING_RAD_S)
+        # What holds one may lead to another.
+        for index, way, effort in list(zip(near, ways.T, efforts.T, strict=True)) * ROUNDS:
             row, nearer = rows[index], float(rows[index] @ reached)
             if nearer <= 0:
                 continue
-            way = np.linalg.solve(metric, row)
-            way /= float(row @ way)
             least = float(np.minimum(row * low, row * high).sum())
-            effort = np.maximum(np.abs(way), ROUNDING_RAD_S)
             change = _towards_end(
                 float(left_m[index]),
                 float(before[index]),

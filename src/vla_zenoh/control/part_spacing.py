@@ -32,8 +32,8 @@ from vla_zenoh.types import FloatArray
 NAME = "part_distance"
 """Of the limit."""
 SPACED_M = 0.25
-"""Arms this much further apart than they may come are looked at every `FAR_S` only."""
 FAR_S = 0.016
+"""Arms `SPACED_M` further apart than they may come are looked at this often."""
 NOISE_M = 2e-5
 """Distances of the same joints differ by less: without it arms at the stop could not go on."""
 SPARE_M = 5e-3
@@ -100,9 +100,9 @@ class PartSpacing:
         if len(at) < len(here):
             return None, None
         before, self.nearest = self.nearest, self._nearest(at)
-        if self.nearest.distance_m >= self._within_m:
-            self._skip, self._held = max(round(FAR_S * self._rate_hz), 1) - 1, False
-            return None, None
+        if self.nearest.distance_m >= self._within_m:  # which fast arms may need for their stops
+            self._skip = max(round(FAR_S * self._rate_hz), 1) - 1
+            ahead_s *= self._skip + 1
         floor_m = self._floor_m(self.nearest.distance_m)
         stops = [part.motion.stopping_rad(ahead_s) for part in self._parts]
         ahead = self._nearest(at, floor_m + NOISE_M, stops)
@@ -116,8 +116,8 @@ class PartSpacing:
             self._held and not (stand and self._may_go_on(at, now_ns, floor_m))
         )
         if self._held:
-            value_m = min(ahead.distance_m, self.nearest.distance_m)
-            return None, LimitHit(NAME, value_m, self._stop_m, where=str(self.nearest))
+            near = ahead if ahead.first else self.nearest
+            return None, LimitHit(NAME, near.distance_m, self._stop_m, where=str(near))
         return self._slow(before), None
 
     def _floor_m(self, now_m: float) -> float:

@@ -207,6 +207,30 @@ def test_a_pose_that_leaves_the_box_is_not_followed_out_of_it(way_m: list[float]
     assert -0.001 < furthest_m <= BEYOND_BOX_M
 
 
+def test_the_tcp_stays_in_a_corner_of_its_box_whose_faces_need_the_same_joints() -> None:
+    """Goals at corners and on the leash; a new one bends the way while the arm is fast."""
+    here = KINEMATICS.forward(HOME_RAD)
+    low, high = here.position_m - 0.1, here.position_m + 0.1
+    faces = np.stack([low, high], axis=1).tolist()
+    box = dict(zip(("x_m", "y_m", "z_m"), faces, strict=True))
+    of = profile(acceleration_rad_s2=2.25, jerk_rad_s3=187.5)
+    arm = Arm(override(of, {"limits": {"workspace": box}}))
+    rng, beyond_m = np.random.default_rng(17), -1.0
+    for _ in range(10):
+        at_m = arm.smoother.motion.pose.position_m
+        way_m = here.position_m + rng.choice([-0.1, 0.1], 3) - at_m
+        way_m *= min(1.0, 0.14 / float(np.linalg.norm(way_m)))
+        turn = exp3(rng.uniform(-0.2, 0.2, 3))
+        arm.goal = Pose(np.clip(at_m + way_m, low, high), turn @ here.rotation)
+        shares = arm.stage.shares(arm.smoother.motion, arm.goal, arm.smoother.box)
+        arm.smoother.target(arm.goal, shares)
+        for _ in range(int(rng.integers(10, 150))):
+            arm.tick()
+            tcp_m = KINEMATICS.forward(arm.joints_rad).position_m
+            beyond_m = max(beyond_m, float(np.maximum(low - tcp_m, tcp_m - high).max()))
+    assert -BEYOND_BOX_M <= beyond_m <= BEYOND_BOX_M
+
+
 def test_a_face_of_the_box_holds_where_the_easiest_joint_brakes_as_hard_as_it_can() -> None:
     row, easiest = np.array([0.3, 0.2, -0.1]), np.array([4.0, -0.5, 1.0])
     reached, low, high = np.array([0.1, 0.2, -0.1]), np.array([0.1, 0.0, -0.3]), np.full(3, 0.4)

@@ -9,10 +9,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from vla_zenoh.control.joint_space import JointBounds, JointPath
+from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.part_spacing import PartSpacing
+from vla_zenoh.control.plan_timeline import joint_goal
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.watchdog import PERIOD_NS
-from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import FloatArray
 
 NOON_NS = 1_700_000_000_000_000_000
@@ -123,3 +126,31 @@ def test_arms_near_each_other_are_slow_while_they_come_nearer_and_not_as_they_pa
 def test_arms_that_begin_too_near_to_each_other_may_move_apart_and_no_nearer() -> None:
     assert not Arms().stand(1.57, ahead=1.56)[1]
     assert Arms().stand(1.57, ahead=1.58)[1]
+
+
+@pytest.mark.parametrize("acceleration_rad_s2", [1.0, 2.25])
+def test_fast_arms_that_brake_gently_stand_before_their_stop(acceleration_rad_s2: float) -> None:
+    """From 1 m apart towards each other: their stops are longer than they are near then."""
+    fast = {
+        "translation": {"velocity_m_s": 1.5, "acceleration_m_s2": 4.0},
+        "joint": {"velocity_rad_s": 2.0, "acceleration_rad_s2": acceleration_rad_s2},
+    }
+    of = override(pair().of_part("left"), {"robot": {"command": "joint"}, "limits": fast})
+    arms, kinematics = Arms(), reach().kinematics
+    paths = [JointPath(of, JointBounds(of, kinematics, reach().barriers)) for _ in arms.parts]
+    for part, path in zip(arms.parts, paths, strict=True):
+        path.stand(leaning(-1.5))
+        goal = joint_goal(kinematics, leaning(2.0), 0.0)
+        path.go_to(goal, path.shares(goal))
+        part.motion = path
+    hit: LimitHit | None = None
+    for number in range(1000):
+        _, hit = arms.spacing.look(NOON_NS + number, 0.004, moves=True)
+        if hit is not None:
+            break
+        for path in paths:
+            path.tick()
+    assert hit is not None
+    assert hit.where.startswith("left ")
+    apart_m = arms.spacing._nearest([path.braked() for path in paths]).distance_m
+    assert 0.0 < apart_m - pair().limits.reach.part_stop_m < 0.03
