@@ -478,6 +478,11 @@ class AxisSmoother:
         return float(np.abs(self._target - self.state.position).max()) < REST_OFFSET
 
     @property
+    def stands(self) -> bool:
+        """Nothing that is commanded moves."""
+        return self.at_rest
+
+    @property
     def _rates(self) -> tuple[FloatArray, FloatArray]:
         return self.state[1:]
 

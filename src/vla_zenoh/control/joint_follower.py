@@ -20,8 +20,8 @@ velocity and ``d`` the difference left beyond it, the acceleration is
 which returns to ``r`` as ``d`` vanishes. No joint exceeds its velocity limit, or the velocity from
 which it can stop before the end of its range, in whole ticks and within both limits; a joint held
 at its end is removed and the others continue without it. Towards a singularity all joints slow
-down so that the singular value s falls no faster than ``ka (s - s_stop)``: an arm that slips
-through a singularity would come back in another branch.
+down so that the singular value s falls no faster than ``ka (s - s_stop)``, and than a stop of all
+joints together allows: an arm that slips through a singularity would come back in another branch.
 
 Damping: Nakamura, Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dyn.
 Sys. Meas. Control 108, 1986.
@@ -34,7 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.limits import LimitHit, workspace_corners
+from vla_zenoh.control.limits import LimitHit, stop_s_of, workspace_corners
 from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose
@@ -47,17 +47,13 @@ DAMPED_BELOW, DAMPING = 0.03, 4e-4
 """Singular value s0 below which the inverse is damped, and wmax, at a singularity."""
 SINGULARITY_1_S = 5.0
 """ka, rate of the approach to a singularity."""
-WATCHED = 4.0
-"""Multiple of `DAMPED_BELOW` under which the rate of the singular value is limited."""
-BACK_SHARE = 0.7
-"""Part of the acceleration used towards a far target, whose path is curved in joint space."""
 NEAR_END_RAD = 0.1
 """A joint further from the end of its range is not reported as held by it."""
 ACCELERATION_HALVINGS = 8
 """Of the search for an acceleration: to 1/256 of the range allowed."""
 NEAR_SHARE, FAR_SHARE = 0.7, 0.1
-"""Part of the joints' acceleration and jerk available for a distance constraint: they follow the
-pose besides. And for the first test whether a constraint is far away."""
+"""Part of the joints' acceleration and jerk for a far target, a distance constraint or a
+singularity: they follow the pose besides. And for the first test whether a constraint is far."""
 ROUNDS = 3
 """Times that the constraints are gone through."""
 ELBOW_COST = 1e-2
@@ -173,7 +169,8 @@ class JointFollower:
         self.posture_rad = posture_rad
         self.acceleration_rad_s2 = np.full(kinematics.size, acceleration_rad_s2)
         self.jerk_rad_s3 = np.full(kinematics.size, jerk_rad_s3)
-        self._back_1_s = BACK_JERK * float(np.min(self.jerk_rad_s3 / self.acceleration_rad_s2))
+        self._ramp_s = float(np.max(self.acceleration_rad_s2 / self.jerk_rad_s3))
+        self._back_1_s = BACK_JERK / self._ramp_s
         self.velocity_rad_s = velocity_share * kinematics.velocity_rad_s
         self.lower_rad = kinematics.lower_rad + margin_rad
         self.upper_rad = kinematics.upper_rad - margin_rad
@@ -232,7 +229,9 @@ class JointFollower:
         """
         joints, velocity = now.position_rad, now.velocity_rad_s
         speed = np.maximum(np.abs(velocity), ROUNDING_RAD_S)
-        slower = np.minimum(self._rampable(speed, dt_s), self.acceleration_rad_s2) * dt_s
+        slower = (
+            np.minimum(_stoppable(speed, self.jerk_rad_s3, dt_s), self.acceleration_rad_s2) * dt_s
+        )
         reached = velocity * (1.0 - min(float(np.min(slower / speed)), 1.0))
         here, jacobian = self.kinematics.pose_and_jacobian(joints)
         low, high = self._allowed(now, dt_s)
@@ -271,32 +270,33 @@ class JointFollower:
         near = np.flatnonzero(~far & rows.any(axis=1)).tolist()
         if not near:
             return reached, hits
-        before = rows @ now.velocity_rad_s
-        metric = jacobian.T @ jacobian + ELBOW_COST * np.eye(jacobian.shape[1])
-        ways = np.linalg.solve(metric, rows[near].T)
-        ways /= (rows[near].T * ways).sum(axis=0)
+        rows, metric = rows[near], jacobian.T @ jacobian + ELBOW_COST * np.eye(len(reached))
+        ways = np.linalg.solve(metric, rows.T)
+        ways /= (rows.T * ways).sum(axis=0)
         # Joints that brake for one constraint have less for others, unless these lie on its way.
-        others = 1.0 - np.clip(rows[near] @ ways, 0.0, 1.0)
-        others[rows[near] @ reached <= 0] = 0.0
+        others = 1.0 - np.clip(rows @ ways, 0.0, 1.0)
+        others[rows @ reached <= 0] = 0.0
         efforts = np.maximum(np.abs(ways) @ (np.eye(len(near)) + others), ROUNDING_RAD_S)
+        known = left_m[near].tolist(), (rows @ now.velocity_rad_s).tolist()
         # What holds one may lead to another.
-        for index, way, effort in list(zip(near, ways.T, efforts.T, strict=True)) * ROUNDS:
-            row, nearer = rows[index], float(rows[index] @ reached)
+        for index, row, way, effort, left, before in ROUNDS * [
+            *zip(near, rows, ways.T, efforts.T, *known, strict=True)
+        ]:
+            nearer = float(row @ reached)
             if nearer <= 0:
                 continue
-            least = float(np.minimum(row * low, row * high).sum())
             change = _towards_end(
-                float(left_m[index]),
-                float(before[index]),
-                (least - float(before[index])) / dt_s,
-                (nearer - float(before[index])) / dt_s,
+                left,
+                before,
+                (float(np.minimum(row * low, row * high).sum()) - before) / dt_s,
+                (nearer - before) / dt_s,
                 NEAR_SHARE * float(np.min(self.acceleration_rad_s2 / effort)),
                 NEAR_SHARE * float(np.min(self.jerk_rad_s3 / effort)),
                 dt_s,
             )
-            allowed = float(before[index]) + change * dt_s
+            allowed = before + change * dt_s
             if nearer > allowed:
-                hits.append(self.constraints.hit(index, float(left_m[index])))
+                hits.append(self.constraints.hit(index, left))
                 reached = self._slower_along(row, way, allowed, reached, low, high)
         return reached, hits
 
@@ -351,7 +351,7 @@ class JointFollower:
         solved = free.T @ np.linalg.solve(free @ free.T + damping * np.eye(6), right)
         whole, feed = solved[:, 0], solved[:, 1]
         back = min(1.0, self._back_1_s * dt_s) * (whole - feed)
-        most = _stoppable(np.abs(back) * dt_s, BACK_SHARE * self.acceleration_rad_s2, dt_s)
+        most = _stoppable(np.abs(back) * dt_s, NEAR_SHARE * self.acceleration_rad_s2, dt_s)
         excess = float(np.max(np.abs(back) / np.maximum(most, 1e-12)))
         if excess > 1.0:
             back = back / excess
@@ -361,14 +361,20 @@ class JointFollower:
         self, joints: FloatArray, wanted: FloatArray, singular_value: float
     ) -> float:
         """Factor on `wanted` at which a singularity is approached slowly enough."""
-        fastest = float(np.abs(wanted).max())
-        if singular_value > WATCHED * DAMPED_BELOW or fastest == 0.0:
+        speed = np.maximum(np.abs(wanted), ROUNDING_RAD_S)
+        fastest, left = float(speed.max()), singular_value - self._singularity_stop
+        # A stop of all joints together takes this and a ramp, and goes as far as half of that.
+        slows_s, ramp_s = float(np.max(speed / self.acceleration_rad_s2)), self._ramp_s
+        if left > fastest * max(1 / SINGULARITY_1_S, slows_s + ramp_s):  # at 1 per radian
             return 1.0
         ahead = joints + wanted * (SINGULARITY_PEEK_RAD / fastest)
         after = smallest_singular_value(self.kinematics.jacobian(ahead))
         fall_1_s = (singular_value - after) / SINGULARITY_PEEK_RAD * fastest
-        allowed = SINGULARITY_1_S * max(singular_value - self._singularity_stop, 0.0)
-        return allowed / fall_1_s if fall_1_s > allowed else 1.0
+        if fall_1_s <= 0.0:
+            return 1.0
+        room_s = max(left, 0.0) / fall_1_s
+        root_s = math.hypot(ramp_s, math.sqrt(8 * NEAR_SHARE * slows_s * room_s))
+        return min(SINGULARITY_1_S * room_s, (root_s - ramp_s) / (2 * slows_s), 1.0)
 
     def _reachable(self, wanted: FloatArray, now: JointMotion, dt_s: float) -> FloatArray:
         """Velocity (n,) after one tick towards `wanted`, without overshoot later."""
@@ -376,13 +382,9 @@ class JointFollower:
         rate = (wanted - now.wanted_rad_s) / dt_s
         rate = np.minimum(np.maximum(rate, -most), most)
         left = wanted - velocity - rate * dt_s
-        acceleration = rate + np.copysign(self._rampable(np.abs(left), dt_s), left)
+        acceleration = rate + np.copysign(_stoppable(np.abs(left), self.jerk_rad_s3, dt_s), left)
         excess = float(np.max(np.abs(acceleration) / most))
         return velocity + acceleration * (dt_s / max(excess, 1.0))
-
-    def _rampable(self, change: FloatArray, dt_s: float) -> FloatArray:
-        """Acceleration (n,) that can return to zero within a change of velocity (n,)."""
-        return _stoppable(change, self.jerk_rad_s3, dt_s)
 
     def _allowed(self, now: JointMotion, dt_s: float) -> tuple[FloatArray, FloatArray]:
         """Least and greatest velocities (n,) of the joints one tick later.
@@ -391,27 +393,22 @@ class JointFollower:
         range. Where these conflict (a joint outside its range, or too fast) the former win.
         """
         joints, velocity, before, _ = now
-        tick, most = self.jerk_rad_s3 * dt_s, self.acceleration_rad_s2
+        jerk, most = self.jerk_rad_s3, self.acceleration_rad_s2
+        tick = jerk * dt_s
         least = np.maximum(np.minimum(before - tick, most), -most)
         greatest = np.minimum(np.maximum(before + tick, -most), most)
-        top, limit, ramp_s = [], self.velocity_rad_s, most / self.jerk_rad_s3
+        top, limit, ramp_s = [], self.velocity_rad_s, most / jerk
         for sign, bound in ((1.0, self.upper_rad), (-1.0, self.lower_rad)):
             room = limit - sign * velocity
-            high = np.where(room >= 0, self._rampable(np.maximum(room, 0.0), dt_s), room / dt_s)
+            high = np.where(room >= 0, _stoppable(np.maximum(room, 0.0), jerk, dt_s), room / dt_s)
             left = sign * (bound - joints)
             # A joint gets faster until the jerk has ended its acceleration.
             fastest = np.maximum(sign * velocity, 0.0) + most * (dt_s + ramp_s)
             near = left < fastest * (dt_s + ramp_s + fastest / (2 * most))
+            ends = (least, greatest) if sign > 0 else (-greatest, -least)
             for joint in np.flatnonzero(near):
-                end = _towards_end(
-                    float(left[joint]),
-                    sign * float(velocity[joint]),
-                    float(least[joint] if sign > 0 else -greatest[joint]),
-                    float(greatest[joint] if sign > 0 else -least[joint]),
-                    float(most[joint]),
-                    float(self.jerk_rad_s3[joint]),
-                    dt_s,
-                )
+                known = left, sign * velocity, *ends, most, jerk
+                end = _towards_end(*(float(values[joint]) for values in known), dt_s=dt_s)
                 high[joint] = min(high[joint], end)
             top.append(high)
         high = np.maximum(np.minimum(greatest, top[0]), least)
@@ -459,9 +456,7 @@ def _stop_way(velocity: float, acceleration: float, most: float, jerk: float) ->
         before = velocity * ramp_s + acceleration * ramp_s**2 / 3
     else:
         before = acceleration * ramp_s**2 / -6 - fastest * ramp_s
-    if fastest < most * most / jerk:
-        return max(before + fastest * math.sqrt(fastest / jerk), 0.0)
-    return max(before + fastest * (fastest / most + most / jerk) / 2, 0.0)
+    return max(before + fastest * stop_s_of(fastest, most, jerk) / 2, 0.0)
 
 
 def _stoppable(distance: FloatArray, acceleration: FloatArray, dt_s: float) -> FloatArray:

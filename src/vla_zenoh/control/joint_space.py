@@ -77,6 +77,11 @@ CURVE_PEEK_RAD = 1e-4
 """Displacement for the rate of the Jacobian: shorter is rounding, longer is curved."""
 
 
+def check_ticks(profile: Profile) -> int:
+    """Ticks from one check of distances to the next."""
+    return max(round(CHECK_S * profile.timing.command_hz), 1)
+
+
 class JointBounds:
     """Bounds of steps and motions of the joints. Independent of time."""
 
@@ -84,9 +89,8 @@ class JointBounds:
         self.limits, self.kinematics, self.barriers = profile.limits, kinematics, barriers
         self._floors = Floors(barriers)
         self.motion = chain_motion_limits(profile, kinematics)
-        self._tcp_rates: FloatArray | None = None
-        if profile.robot.command == "pose":
-            self._tcp_rates = motion_limits(profile.limits).box[0]
+        poses = profile.robot.command == "pose"
+        self._tcp_rates = motion_limits(profile.limits).box[0] if poses else None
         margin_rad = joint_margins(self.limits.reach, kinematics)
         self.lower_rad = kinematics.lower_rad + margin_rad
         self.upper_rad = kinematics.upper_rad - margin_rad
@@ -155,7 +159,7 @@ class JointBounds:
         """
         target_rad, hits = self.into_ranges(start_rad, asked_rad)
         yield
-        before = self._barriers_at(start_rad)
+        before = self.barriers_at(start_rad)
         floor = self._floors.after(before)
         yield
         after, found = self._try(start_rad, target_rad, floor)
@@ -175,7 +179,7 @@ class JointBounds:
         slower = self.barriers.slowdown(before, after)
         return BoundedStep(self.kinematics.forward(target_rad), hits, target_rad, slower)
 
-    def _barriers_at(self, joints_rad: FloatArray) -> FloatArray:
+    def barriers_at(self, joints_rad: FloatArray) -> FloatArray:
         """Barriers of the distances; a singularity is none."""
         left_m = self.barriers.collisions.distances(joints_rad) - self.barriers.stop[1:]
         return np.concatenate([[np.inf], left_m])
@@ -214,10 +218,10 @@ class JointBounds:
         self, start_rad: FloatArray, end_rad: FloatArray, floor: FloatArray
     ) -> tuple[FloatArray, LimitHit | None]:
         """Barriers at the end of a step, and the limit that forbids it."""
-        after = self._barriers_at(end_rad)
+        after = self.barriers_at(end_rad)
         hit = self._box_hit(start_rad, end_rad)
         short = after - floor
-        index = int(np.argmin(short[1:])) + 1 if len(short) > 1 else 0
+        index = int(np.argmin(short))
         if hit is None and short[index] < 0:
             hit = self.barriers.hit(index, after[index], floor[index])
         return after, hit
@@ -241,29 +245,21 @@ class JointBounds:
     ) -> LimitHit | None:
         """The bound that the straight motion between two joints would violate."""
         hit = self._box_hit(start_rad, end_rad)
-        return self.distance_hit(start_rad, end_rad, floor) if hit is None else hit
+        return hit or self.distance_hit(start_rad, end_rad, floor)
 
     def distance_hit(
         self, start_rad: FloatArray, end_rad: FloatArray, floor: FloatArray
     ) -> LimitHit | None:
         """The distance that would be too small at the end of a motion between two joints.
 
-        Below zero it must not fall under its `floor` (n,), see `raised`.
+        Below zero it must not fall under its `floor` (n,).
         """
         if np.array_equal(start_rad, end_rad):
             return None
-        after = self._barriers_at(end_rad)
+        after = self.barriers_at(end_rad)
         short = after - floor + NEARER_M
         index = int(np.argmin(short))
         return self.barriers.hit(index, after[index]) if short[index] < 0 else None
-
-    def raised(self, floor: FloatArray, joints_rad: FloatArray) -> FloatArray:
-        """The floor (n,) of an arm that has come to these joints: no distance falls again.
-
-        If each motion were compared with its own start, a slow one, or one that stops and goes,
-        would pass any bound by `NEARER_M` at a time.
-        """
-        return np.maximum(floor, np.minimum(self._barriers_at(joints_rad), 0.0))
 
 
 class JointPath(AxisSmoother):
@@ -273,9 +269,8 @@ class JointPath(AxisSmoother):
 
     def __init__(self, profile: Profile, bounds: JointBounds) -> None:
         self.kinematics, self._bounds = bounds.kinematics, bounds
-        self._names = bounds.kinematics.arm_joints
         self._tcp_box = motion_limits(profile.limits).box
-        self._check_ticks = max(round(CHECK_S * profile.timing.command_hz), 1)
+        self._check_ticks = check_ticks(profile)
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
         self._before_bound = False
@@ -295,7 +290,7 @@ class JointPath(AxisSmoother):
         self._unchecked = 0
         """Ticks since distances were looked at."""
         self._floor = np.full(len(self._bounds.barriers.stop), -np.inf)
-        """(n,) greatest violation of each distance that is left, see `JointBounds.raised`."""
+        """(n,) least values of distances, see `_raise_floor`."""
         self._held = self._bounds.barriers.collisions.held
         self._follow()
 
@@ -355,10 +350,10 @@ class JointPath(AxisSmoother):
         self._asked, self._before_bound = (goal, shares, all_to_stop), False
         here_rad, end_rad = self.state.position, goal.known_rad
         self._raise_floor()
-        near_hit = None if self._goes else self._near_hit()
-        if near_hit is not None:
-            self._brake_at(near_hit)
-            return True
+        if not self._goes:
+            self._brake_at(self._near_hit())
+            if self._before_bound:
+                return True
         hit = self._bounds.ahead_hit(here_rad, end_rad, self._floor)
         if hit is not None:
             self._hits.append(hit)
@@ -369,26 +364,26 @@ class JointPath(AxisSmoother):
                 low, high = (low, middle) if found else (middle, high)
             end_rad = here_rad + low * way_rad
         planned = self.move_to(end_rad, shares, all_to_stop=all_to_stop)
-        if self._goes:
-            self._check()
+        if self._goes:  # it may get faster until the next check
+            self._brake_at(self._near_hit())
         return planned
 
-    def tick(self, part: float = 1.0) -> Motion:
-        """Advance by `part` of a tick; brakes where the motion would come too near to a bound."""
+    def tick(self) -> Motion:
+        """Advance by a tick; brakes where the motion would come too near to a bound."""
         if self._before_bound and self.at_rest:
             self._go_on()
         if self._unchecked >= self._check_ticks and self._goes:
             self._raise_floor()
-            self._check()
+            self._brake_at(self._near_hit())
         self._unchecked += 1
         before = self.state
-        moves = self.advance(part)
-        if moves and not self.braking and not self._stops_inside(part):
+        moves = self.advance(1.0)
+        if moves and not (self.braking or self._stops_inside()):
             hit = self._stop_hit()
             if hit is not None:
                 self.state = before  # a stop from there was found to end inside
                 self._brake_at(hit)
-                self.advance(part)
+                self.advance(1.0)
         if moves:
             self._follow()
         return self.motion
@@ -411,29 +406,30 @@ class JointPath(AxisSmoother):
             self.brake()
             self._before_bound = True
 
-    def _check(self) -> None:
-        """Brake if the motion would come too near; it may get faster until the next check."""
-        self._unchecked = 0
-        self._brake_at(self._near_hit())
-
     @property
     def _goes(self) -> bool:
         return not (self.braking or self.at_rest)
 
     def _raise_floor(self) -> None:
+        """No distance falls again, once it is below zero.
+
+        If each motion were compared with its own start, a slow one, or one that stops and goes,
+        would pass any bound by `NEARER_M` at a time.
+        """
         held = self._bounds.barriers.collisions.held
         if held != self._held:  # what is too near now may move away
             self._held, self._floor = held, np.full(len(self._floor), -np.inf)
-        self._floor = self._bounds.raised(self._floor, self.state.position)
+        left_m = self._bounds.barriers_at(self.state.position)
+        self._floor = np.maximum(self._floor, np.minimum(left_m, 0.0))
 
     def _near_hit(self) -> LimitHit | None:
         """The distance that would be too small at the end of a stop, begun before the next check.
 
         Of an arm that stands: after the first bit of the way to what was asked for last.
         """
-        here_rad = self.state.position
+        here_rad, self._unchecked = self.state.position, 0
         if self.at_rest:
-            way_rad = self._asked[0].known_rad - here_rad
+            way_rad = self.way_to(self._asked[0])
             longest_rad = float(np.abs(way_rad).max())
             ahead_rad = way_rad * (PROBE_RAD / max(longest_rad, PROBE_RAD))
         elif self.braking:  # an upper bound, so that a new goal does not end the brake
@@ -446,10 +442,9 @@ class JointPath(AxisSmoother):
         """Continue after a brake before a bound, if the straight way to the goal is free."""
         goal, shares, all_to_stop = self._asked
         self._before_bound = False
-        here_rad, goal_rad = self.state.position, goal.known_rad
         self._raise_floor()
-        near_hit = self._near_hit()
-        if not (near_hit or self._bounds.ahead_hit(here_rad, goal_rad, self._floor)):
+        way_rad = self.state.position, goal.known_rad
+        if not (self._near_hit() or self._bounds.ahead_hit(*way_rad, self._floor)):
             self.go_to(goal, shares, all_to_stop=all_to_stop)
 
     def _stop_hit(self) -> LimitHit | None:
@@ -464,12 +459,12 @@ class JointPath(AxisSmoother):
         stop_rad = [stop.at(float(time_s)).position for time_s in times_s]
         return self._bounds.face_hit(self.motion.pose.position_m, stop_rad)
 
-    def _stops_inside(self, part: float) -> bool:
+    def _stops_inside(self) -> bool:
         """Whether the TCP is too far from every face of the box for a stop to cross one."""
         low, high = workspace_corners(self._bounds.limits)
         place = self.motion.pose.position_m
         room_m = float(np.minimum(place - low, high - place).min())
-        way = np.abs(stop_way(*self.state[1:], self.box, part * self._dt_s))
+        way = np.abs(stop_way(*self.state[1:], self.box, self._dt_s))
         # A joint moves the TCP by its way times its lever, which grows by what the TCP has moved:
         # all together by a factor of exp(their ways) at most (Gronwall).
         return float(way @ self._levers) * math.exp(float(way.sum())) < room_m
@@ -507,11 +502,6 @@ class JointPath(AxisSmoother):
 
     # -- the same interface as for poses ------------------------------------------------------
     @property
-    def stands(self) -> bool:
-        """No joint moves."""
-        return self.at_rest
-
-    @property
     def joints_rad(self) -> FloatArray:
         """(n,) joints commanded."""
         return self.state.position
@@ -520,13 +510,7 @@ class JointPath(AxisSmoother):
         """Advance by one tick."""
         self.tick()
 
-    def stop(self) -> None:
-        """Come to rest."""
-        self.brake()
-
-    def pause(self) -> None:
-        """Come to rest, to go on from there."""
-        self.brake()
+    stop = pause = brake
 
     def way_to(self, goal: Goal) -> FloatArray:
         """(n,) from the commanded joints to those of `goal`."""
@@ -549,7 +533,7 @@ class JointPath(AxisSmoother):
 
     def command(self, state: str, cause: Cause | None, goal: Goal | None) -> JointCommand:
         """The joint command of this tick."""
-        return JointCommand(self._names, *self.state, state, cause)
+        return JointCommand(self.kinematics.arm_joints, *self.state, state, cause)
 
 
 def followed_shares(

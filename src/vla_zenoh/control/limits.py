@@ -116,6 +116,13 @@ def stop_way(
     return (ahead_s + stop_s) * fast
 
 
+def stop_s_of(speed: float, most: float, jerk: float) -> float:
+    """How long a stop takes from constant `speed`; it goes half as far as `speed` would."""
+    if speed * jerk < most * most:
+        return 2.0 * math.sqrt(speed / jerk)
+    return speed / most + most / jerk
+
+
 def between(start: FloatArray, end: FloatArray) -> list[FloatArray]:
     """Two places (n,) of a short motion: half of it, and its end."""
     return [0.5 * (start + end), end]

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vla_zenoh.control.commanded_part import CommandedPart
-from vla_zenoh.control.joint_space import PROBE_RAD
+from vla_zenoh.control.joint_space import PROBE_RAD, check_ticks
 from vla_zenoh.control.limits import LimitHit, Slowdown, between, in_steps
 from vla_zenoh.control.watchdog import BAND, PAST, PERIOD_NS
 from vla_zenoh.kinematics.collision import Nearest, PlacedArm
@@ -32,8 +32,7 @@ from vla_zenoh.types import FloatArray
 NAME = "part_distance"
 """Of the limit."""
 SPACED_M = 0.25
-FAR_S = 0.016
-"""Arms `SPACED_M` further apart than they may come are looked at this often."""
+"""Arms this much further apart than they may come are looked at as often as joints alone."""
 NOISE_M = 2e-5
 """Distances of the same joints differ by less: without it arms at the stop could not go on."""
 SPARE_M = 5e-3
@@ -62,7 +61,7 @@ class PartSpacing:
         self._within_m = max(self._slow_m, self._stop_m) + SPACED_M
         self.nearest = Nearest(self._within_m)
         """Distance of the commanded joints when last computed."""
-        self._rate_hz = profile.timing.command_hz
+        self._check_ticks = check_ticks(profile)
         self._skip = 0
         self._held = self._slower = False
         self._reached_m = -np.inf
@@ -101,8 +100,8 @@ class PartSpacing:
             return None, None
         before, self.nearest = self.nearest, self._nearest(at)
         if self.nearest.distance_m >= self._within_m:  # which fast arms may need for their stops
-            self._skip = max(round(FAR_S * self._rate_hz), 1) - 1
-            ahead_s *= self._skip + 1
+            self._skip = self._check_ticks - 1
+            ahead_s *= self._check_ticks
         floor_m = self._floor_m(self.nearest.distance_m)
         stops = [part.motion.stopping_rad(ahead_s) for part in self._parts]
         ahead = self._nearest(at, floor_m + NOISE_M, stops)

@@ -20,7 +20,7 @@ from vla_zenoh.control.joint_follower import (
     JointFollower,
     JointMotion,
 )
-from vla_zenoh.control.joint_space import BEND, CHECK_S, followed_shares
+from vla_zenoh.control.joint_space import BEND, check_ticks, followed_shares
 from vla_zenoh.control.limits import (
     FULL,
     Shares,
@@ -101,14 +101,13 @@ class PoseToJoint:
             self._constraints,
             acceleration_rad_s2=acceleration,
             jerk_rad_s3=jerk,
-            velocity_share=min(share, 1.0),
+            velocity_share=share,
             margin_rad=joint_margins(limits.reach, kinematics),
             singularity_stop=limits.reach.singularity_stop,
         )
         most = float(jerk.min()) / PULL_JERK / POSTURE_RAD_S
         self._pull_1_s = min(PULL_1_S, most**0.5)
-        self._dt_s = 1.0 / profile.timing.command_hz
-        self._names = kinematics.arm_joints
+        self._dt_s, self._check_ticks = 1.0 / profile.timing.command_hz, check_ticks(profile)
         self._held_by: set[str] = set()
         self.restart(home_rad)
 
@@ -194,7 +193,7 @@ class PoseToJoint:
         """
         here = self._kinematics.forward(self._now.position_rad)
         lag = self._lag(here, smoother.motion.pose)
-        if self._ticks % max(round(CHECK_S / self._dt_s), 1) == 0:
+        if self._ticks % self._check_ticks == 0:
             self._constraints.update(self._now.position_rad)
         self._ticks += 1
         # Held joints approach a standing pose for as long as it takes.
@@ -275,7 +274,7 @@ class PoseToJoint:
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
         """The joint command of this tick."""
-        return JointCommand(self._names, *self._now[:3], state, cause)
+        return JointCommand(self._kinematics.arm_joints, *self._now[:3], state, cause)
 
 
 class FollowedPath(PosePath):
@@ -318,8 +317,7 @@ class FollowedPath(PosePath):
         """Come to rest as fast as the joints can."""
         self.joints.brake(self)
 
-    def pause(self) -> None:
-        self.joints.brake(self)
+    pause = stop
 
     def command(self, state: str, cause: Cause | None, goal: Goal | None) -> JointCommand:
         return self.joints.command(state, cause)

@@ -171,11 +171,6 @@ class PosePath(Smoother):
         super().__init__(start, 1.0 / profile.timing.command_hz, motion_limits(limits), box)
 
     @property
-    def stands(self) -> bool:
-        """Nothing that is commanded moves."""
-        return self.at_rest
-
-    @property
     def tcp(self) -> Motion:
         """The commanded motion of the TCP."""
         return self.motion

@@ -29,7 +29,7 @@ import numpy as np
 
 from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.joint_space import JointPath
-from vla_zenoh.control.limits import APPROACH, FULL, Shares, Slowdown, slowest
+from vla_zenoh.control.limits import APPROACH, FULL, Shares, Slowdown, slowest, stop_s_of
 from vla_zenoh.control.plan_timeline import Goal, Plan
 from vla_zenoh.control.pose_to_joint import LEAST_SPEED
 from vla_zenoh.control.smoothing import PosePath
@@ -143,7 +143,7 @@ class StepTiming:
         most, jerk = most * override**2, jerk * override**3
         share = least = length / time_s
         for _ in range(3):
-            stop_s = _stop_s(min(share, 1.0), most, jerk)
+            stop_s = stop_s_of(min(share, 1.0), most, jerk)
             share = length / (time_s + 0.5 * stop_s)
             least = length / max(left_s - 0.6 * stop_s, 1e-3)
         if MOVING * share < now:
@@ -174,13 +174,6 @@ class StepTiming:
         self._late_ns = max(late_ns, kept_ns)
         self._plan, self._took_ns = plan, plan_ns
         self._begun_ns = plan_ns + self._late_ns - late_ns
-
-
-def _stop_s(speed: float, most: float, jerk: float) -> float:
-    """How long a stop takes from constant `speed`, within an acceleration and a jerk."""
-    if speed * jerk < most * most:
-        return 2.0 * math.sqrt(speed / jerk)
-    return speed / most + most / jerk
 
 
 class TimedGoal(NamedTuple):

@@ -12,7 +12,7 @@ from vla_zenoh.control.limits import into_workspace, joint_motion_limits, motion
 from vla_zenoh.control.pose_to_joint import FAR, LAG_M, LAG_RAD, PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import Smoother
-from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.kinematics import make_kinematics, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose, exp3, pose_distance
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import FloatArray
@@ -304,6 +304,23 @@ def test_a_joint_that_brakes_gently_stops_before_its_end() -> None:
     assert follower.upper_rad[6] - 0.05 < motion.position_rad[6] <= follower.upper_rad[6] + RTOL
 
 
+@pytest.mark.parametrize(("acceleration", "jerk"), [(2.25, 187.5), (1.0, 50.0)])
+def test_an_arm_that_brakes_gently_does_not_slip_through_a_singularity(
+    acceleration: float, jerk: float
+) -> None:
+    """A pose goes on beyond the reach at 0.4 m/s; the arm is slow enough before it is stretched."""
+    follower = JointFollower(
+        KINEMATICS, HOME_RAD, acceleration_rad_s2=acceleration, jerk_rad_s3=jerk
+    )
+    motion, here = JointMotion.standing(HOME_RAD), KINEMATICS.forward(HOME_RAD)
+    twist, least = np.array([0.343, 0.0, 0.206, 0.0, 0.0, 0.0]), 1.0
+    for number in range(900):
+        pose = Pose(here.position_m + number * TICK_S * twist[:3], here.rotation)
+        motion, _ = follower.step(motion, pose, twist, TICK_S)
+        least = min(least, smallest_singular_value(KINEMATICS.jacobian(motion.position_rad)))
+    assert least == pytest.approx(BASE.limits.reach.singularity_stop, rel=0.01)
+
+
 def test_slopes_of_distances_are_those_of_small_steps() -> None:
     collisions = ReachabilityFilter(BASE, KINEMATICS).barriers.collisions
     random, compared = np.random.default_rng(0), 0
@@ -312,7 +329,7 @@ def test_slopes_of_distances_are_those_of_small_steps() -> None:
             HOME_RAD + 0.4 * random.normal(size=7), KINEMATICS.lower_rad, KINEMATICS.upper_rad
         )
         near = np.flatnonzero(np.abs(collisions.distances(joints_rad) - 0.05) < 0.04)
-        slopes = collisions.gradients(joints_rad, near)
+        slopes = collisions.gradients(joints_rad, near.tolist())
         for joint, unit in enumerate(np.eye(7) * 1e-5):
             apart = collisions.distances(joints_rad + unit) - collisions.distances(
                 joints_rad - unit
