@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,7 @@ from lerobot_robot_vla_zenoh.numbers import ArmNumbers
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import load_profile, override
+from vla_zenoh.types import GripperState, JointState
 
 pytestmark = [pytest.mark.models, pytest.mark.timeout(280)]
 
@@ -214,6 +216,27 @@ def test_a_leader_is_read_in_the_numbers_of_the_follower(arm: Chain, tmp_path: P
 def test_arms_that_lerobot_has_no_numbers_for_are_rejected_by_name(tmp_path: Path) -> None:
     with pytest.raises(ProfileError, match="has the parts left, right"):
         VlaZenohConfig(profile="two_pandas_sim")
+
+
+def test_an_arm_without_a_gripper_has_its_joints_alone() -> None:
+    bare = override(load_profile("so101_sim"), {"robot": {"gripper": None, "finger_joints": []}})
+    numbers = ArmNumbers(bare, FPS)
+    assert numbers.names == NAMES[:-1]
+    assert numbers.action.gripper == "none"
+    goal = dict(zip(NAMES, (10.0, -20.0, 30.0, 40.0, -500.0), strict=False))
+    step = numbers.step(numbers.within_range(goal))
+    np.testing.assert_allclose(step[:4], np.radians([10, -20, 30, 40]), atol=1e-12)
+    assert len(step) == 5
+    at = JointState(JOINTS, np.radians([1.0, 2, 3, 4, 5]), np.zeros(5), None)
+    none = GripperState(None, moving=False, holding=False)
+    header = SimpleNamespace(stamp_wall_ns=1, seq=1)
+    remote: Any = SimpleNamespace(
+        joint_state=lambda: SimpleNamespace(record=at, header=header),
+        gripper_state=lambda: SimpleNamespace(record=none, header=header),
+    )
+    assert [*numbers.measured(remote).values()] == pytest.approx([1, 2, 3, 4, 5], abs=1e-5)
+    with pytest.raises(ValueError, match=r"the arm has no gripper\.pos"):
+        numbers.within_range({**goal, "gripper.pos": 1.0})
 
 
 def test_positions_go_through_both_directions(tmp_path: Path) -> None:

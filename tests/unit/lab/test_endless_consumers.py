@@ -190,6 +190,17 @@ def test_an_agent_is_told_a_turn_and_goes_the_shortest_way(tmp_path: Path) -> No
     assert way[-1] == pytest.approx([*AWAY[:5], AWAY[5] + 0.3, 0.5])
 
 
+def test_an_agent_moves_an_arm_without_a_gripper_by_its_joints(tmp_path: Path) -> None:
+    profile = endless_arm(tmp_path, robot={"gripper": None})
+    targets = Targets(profile, 10.0)
+    assert targets.labels == profile.robot.arm_joints
+    assert targets.action.gripper == "none"
+    assert len(targets.low) == len(targets.high) == len(targets.most) == 6
+    there = HOME + np.array([0, 0, 0, 0, 0, 0.3])
+    assert targets.refusal(HOME, there) == ""
+    assert targets.way(HOME, there)[-1] == pytest.approx(there)
+
+
 def test_joints_after_many_turns_conform(profile: Profile) -> None:
     still = np.zeros(6)
     state = JointState(profile.robot.arm_joints, AWAY, still, still, endless=ENDLESS)

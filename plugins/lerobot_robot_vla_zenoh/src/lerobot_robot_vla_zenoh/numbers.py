@@ -1,4 +1,7 @@
-"""An arm in LeRobot's numbers: ``JOINT.pos`` in degrees, ``gripper.pos`` 0 shut to 100 open."""
+"""An arm in LeRobot's numbers: ``JOINT.pos`` in degrees, ``gripper.pos`` 0 shut to 100 open.
+
+An arm without a gripper has no ``gripper.pos``.
+"""
 
 from __future__ import annotations
 
@@ -37,11 +40,14 @@ class ArmNumbers:
 
     def __init__(self, profile: Profile, fps: int) -> None:
         joints = profile.robot.arm_joints
-        options = {**LEROBOT, "dt_s": repr(1 / fps), "horizon": "1"}
+        grips = profile.robot.gripper is not None
+        units = {name: unit for name, unit in LEROBOT.items() if grips or "grip" not in name}
+        options = {"gripper": "none", **units, "dt_s": repr(1 / fps), "horizon": "1"}
         self._semantics = read_action_semantics(options, joints=joints)
-        self._state = state_numbers(read_parts(LEROBOT_STATE), profile, self._semantics.state_units)
+        parts = read_parts(LEROBOT_STATE if grips else "joint")
+        self._state = state_numbers(parts, profile, self._semantics.state_units)
         self.action = self._semantics.spec
-        self.names = [*(f"{name}.pos" for name in joints), "gripper.pos"]
+        self.names = [f"{name}.pos" for name in joints] + ["gripper.pos"] * grips
         kinematics = make_kinematics(profile)
         order = [kinematics.arm_joints.index(name) for name in joints]
         if sliding := [
@@ -51,7 +57,7 @@ class ArmNumbers:
         margin_rad = profile.limits.reach.joint_margin_rad
         lower_rad, upper_rad = kinematics.lower_rad[order], kinematics.upper_rad[order]
         ends = np.array([[*(lower_rad + margin_rad), 0.0], [*(upper_rad - margin_rad), 1.0]])
-        self._lowest, self._highest = self._semantics.rows(ends)
+        self._lowest, self._highest = self._semantics.rows(ends[:, : len(self.names)])
 
     def features(self) -> dict[str, type]:
         """Name -> type of each number."""

@@ -36,7 +36,7 @@ FIRST_CHUNK_S = 20.0
 """A command node that is just starting has sent its task within this."""
 SETTLE_S, SETTLED_RAD, SETTLE_STEPS = 5.0, 0.01, 20
 NOTES = """\
-Joint targets in rad ({joints}), absolute; gripper 0 (shut) to 1 (open). A target that the arm's
+Joint targets in rad ({joints}), absolute; a gripper 0 (shut) to 1 (open). A target that the arm's
 limits do not allow (joint ranges, workspace box, table, keep-outs, itself) is refused before
 anything moves: the arm stays where it is, and the reason names limit and place."""
 
@@ -44,7 +44,7 @@ Numbers = NDArray[np.float64]
 
 
 class Arm(EmbodimentBase):
-    """An arm on the bus: absolute joints and gripper, under all limits of its profile.
+    """An arm on the bus: absolute joints and its gripper, under all limits of its profile.
 
     It takes the arm at the first `reset` and activates it for as long as this process lives;
     `close` brakes it. A target that its limits do not allow is refused: the arm stays, the trial
@@ -73,7 +73,6 @@ class Arm(EmbodimentBase):
             loaded = load_profile(profile)
             if endpoint:
                 loaded = override(loaded, {"session": {"connect": [endpoint]}})
-            self._max_width_m = loaded.robot.require_gripper("its action has one").max_width_m
             self._targets = Targets(loaded, rate_hz)
         except VlaZenohError as error:
             raise ConfigError(str(error)) from error
@@ -134,7 +133,7 @@ class Arm(EmbodimentBase):
 
     # -- for agents ---------------------------------------------------------------------------
     def pre_check(self, waypoints: Numbers) -> str | None:
-        """Why the arm cannot go along waypoints (k, n + 1) from where it is; None if it can.
+        """Why the arm cannot go along waypoints (k, n) from where it is; None if it can.
 
         For ``LLMAgentPolicy(pre_check=arm.pre_check)``: the model is told, and corrects itself.
         """
@@ -186,7 +185,8 @@ class Arm(EmbodimentBase):
 
     def _drive_home(self) -> None:
         assert self._goal is not None
-        home = np.array([*self._profile.robot.home_rad, self._goal[-1]])
+        home_rad = self._profile.robot.home_rad
+        home = np.array([*home_rad, *self._goal[len(home_rad) :]])
         if why := self._targets.refusal(self._goal, home):
             raise EmbodimentFault(f"the arm cannot go straight home: {why}")
         for target in self._targets.way(self._goal, home):
@@ -194,7 +194,9 @@ class Arm(EmbodimentBase):
             self._send(target)
             self._pace()
         give_up_s = time.monotonic() + SETTLE_S
-        while np.abs(self._targets.apart(self._measured(), home))[:-1].max() > SETTLED_RAD:
+        while (
+            np.abs(self._targets.apart(self._measured(), home))[: len(home_rad)].max() > SETTLED_RAD
+        ):
             if time.monotonic() > give_up_s:
                 raise EmbodimentFault("the arm does not arrive at home: `vla-zenoh status` has why")
             self._driven()
@@ -203,10 +205,12 @@ class Arm(EmbodimentBase):
     def _measured(self) -> Numbers:
         assert self._robot is not None
         joint = joints_as(self._robot.joint_state().record, "wrapped")
-        gripper = self._robot.gripper_state().record
         at = dict(zip(joint.names, joint.position_rad, strict=True))
-        opening = gripper.kept_width_m / self._max_width_m
-        joints = [float(at[name]) for name in self._profile.robot.arm_joints]
+        robot = self._profile.robot
+        joints = [float(at[name]) for name in robot.arm_joints]
+        if robot.gripper is None:
+            return np.array(joints)
+        opening = self._robot.gripper_state().record.kept_width_m / robot.max_width_m
         return np.array([*joints, min(float(opening), 1.0)])
 
     def _see(self, refused: str = "") -> Observation:
@@ -245,7 +249,7 @@ def _info(
             high=targets.high,
             semantics=ActionSemantics(
                 control_mode="joint_pos",
-                gripper="continuous",
+                gripper="continuous" if profile.robot.gripper is not None else "none",
                 dim_labels=targets.labels,
                 max_step=tuple(most),
             ),
@@ -259,6 +263,6 @@ def _info(
         control_hz=rate_hz,
         is_simulated=profile.robot.driver == "sim",
         capabilities=frozenset((RESETTABLE, SELF_PACED)),
-        docs=NOTES.format(joints=", ".join(targets.labels[:-1])),
+        docs=NOTES.format(joints=", ".join(profile.robot.arm_joints)),
         environment_id=f"{profile.root}/{profile.robot.name}",
     )
