@@ -22,6 +22,7 @@ from vla_zenoh.control.axis_smoothing import AxisSmoother, line_of
 from vla_zenoh.control.limits import (
     FULL,
     LEAST_TO_GOAL,
+    PAUSE_LEAD_M,
     PAUSE_LEAD_RAD,
     BoundedStep,
     LimitHit,
@@ -272,7 +273,6 @@ class JointPath(AxisSmoother):
         self._tcp_box = motion_limits(profile.limits).box
         self._check_ticks = check_ticks(profile)
         self._hits: list[LimitHit] = []
-        self._asked: tuple[Goal, Shares, bool]
         self._before_bound = False
         """It braked before a bound, on the way to what was asked for last."""
         home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
@@ -327,10 +327,11 @@ class JointPath(AxisSmoother):
     def near(self, goal: Goal) -> Goal:
         """`goal`, or one so near that the arm can retreat from there."""
         way_rad = self.way_to(goal)
-        share = PAUSE_LEAD_RAD / max(float(np.abs(way_rad).max()), PAUSE_LEAD_RAD)
-        if share >= 1.0:
+        leads = np.where(self.kinematics.slides, PAUSE_LEAD_M, PAUSE_LEAD_RAD)
+        longest = (np.abs(way_rad) / leads).max()
+        if longest <= 1.0:
             return goal
-        nearer_rad = self.state.position + share * way_rad
+        nearer_rad = self.state.position + way_rad / longest
         return joint_goal(self.kinematics, nearer_rad, goal.width_m, goal.slowdown)
 
     def resting_goal(self, _: Pose, width_m: float) -> Goal:

@@ -10,6 +10,7 @@ from joint_rig import Joints
 from made_arm import SLIDE_M, made_arm
 
 from vla_zenoh.control.commander import Setting
+from vla_zenoh.control.plan_timeline import joint_goal
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import override
 
@@ -81,6 +82,18 @@ def test_its_goal_is_on_a_leash_of_metres(tmp_path: Path) -> None:
                 ahead.append(abs(goal.joints_rad[0] - arm.joints_rad[0]))
     assert max(ahead) < arm.profile.limits.lead_m + 1e-3
     assert "lead_m" in arm.hits()
+
+
+def test_the_goal_of_an_arm_that_is_held_leads_a_joint_that_slides_by_metres(
+    tmp_path: Path,
+) -> None:
+    arm = Joints(made_arm(tmp_path, MIXED))
+    path = arm.rig.commander.parts[0].motion._path
+    assert path is not None
+    path.stand(arm.home_rad)
+    for far, near in (([0.1, 0, 0, 0], [0.01, 0, 0, 0]), ([0, 0.1, 0, 0.005], [0, 0.02, 0, 1e-3])):
+        goal = path.near(joint_goal(path.kinematics, arm.home_rad + far, 0.0))
+        assert goal.known_rad - arm.home_rad == pytest.approx(near, abs=EXACT)
 
 
 def test_millimetres_are_rejected_with_the_joint_and_its_unit(tmp_path: Path) -> None:
