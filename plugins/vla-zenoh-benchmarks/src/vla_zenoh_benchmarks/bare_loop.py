@@ -56,12 +56,13 @@ def main(rate_hz: float) -> None:
     ticks = missed = 0
     with realtime_thread():
         loop = FixedRate(rate_hz)
-        print("begins", flush=True)
+        sys.stdout.write("begins\n")
+        sys.stdout.flush()
         while not ended.is_set():
             periods = loop.wait().periods
             ticks += periods
             missed += periods - 1
-    print(ticks, missed)
+    sys.stdout.write(f"{ticks} {missed}\n")
 
 
 if __name__ == "__main__":
