@@ -7,6 +7,8 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
+from vla_zenoh.runtime.process import realtime_links
+
 FLUSH_S = 0.5
 
 
@@ -22,7 +24,8 @@ class KeptText:
         self._path, self._about = path, about
         self._wanted: queue.SimpleQueue[str | threading.Event | None] = queue.SimpleQueue()
         self._failures: queue.SimpleQueue[str] = queue.SimpleQueue()
-        threading.Thread(target=self._run, name="keeper", daemon=True).start()
+        with realtime_links():  # it shares the GIL with the command loop
+            threading.Thread(target=self._run, name="keeper", daemon=True).start()
 
     def read(self) -> str | None:
         """The text; None: there is none. Of a file that cannot be read, why not."""

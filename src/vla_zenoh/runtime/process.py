@@ -113,6 +113,7 @@ def run_node(
     die_with_parent()
     if preferred:  # before Zenoh starts its threads
         prefer_this_process()
+        _prefer_watch()
     # A supervisor may still be starting the router.
     wait_s = ROUTER_PATIENCE_S if PARENT_VARIABLE in os.environ else 0.0
     try:
@@ -151,6 +152,14 @@ def prefer_this_process() -> None:
     """
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+
+
+def _prefer_watch() -> None:
+    """SCHED_FIFO for the watch over the supervisor, where permitted: see `realtime_links`."""
+    watches = [thread.native_id for thread in threading.enumerate() if thread.name == WATCH]
+    with suppress(OSError, AttributeError):
+        for thread_id in filter(None, watches):
+            os.sched_setscheduler(thread_id, os.SCHED_FIFO, os.sched_param(LINK_PRIORITY))
 
 
 def realtime_links() -> AbstractContextManager[bool]:

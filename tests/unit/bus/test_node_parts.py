@@ -6,10 +6,12 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from tempfile import NamedTemporaryFile
 
 import pytest
 import zenoh
@@ -267,6 +269,35 @@ def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
         told = until("the event", events.drain)
         words = b"prompt: %d bytes, at most %d are accepted" % (limit + 1, limit)
         assert words in told[-1].sample.payload.to_bytes()
+        node.close()
+
+
+@pytest.fixture
+def opened() -> Iterator[list[str]]:
+    """Files that Python opens from now on."""
+    paths: list[str] = []
+    ended = threading.Event()
+
+    def hook(event: str, arguments: tuple[object, ...]) -> None:
+        if event == "open" and not ended.is_set():
+            paths.append(str(arguments[0]))
+
+    sys.addaudithook(hook)
+    yield paths
+    ended.set()  # a hook cannot be removed
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="files of Linux")
+def test_a_status_reads_no_file_for_which_a_control_loop_would_wait(opened: list[str]) -> None:
+    """/proc/locks lets its reader wait for the grace period of RCU, 5 to 15 ms."""
+    with (
+        two_sessions() as (profile, _, session),
+        NamedTemporaryFile(dir="/dev/shm", suffix=".zenoh"),
+    ):
+        node = Node("command", profile, session)
+        opened.clear()
+        node.publish_status("inactive")
+        assert set(opened) <= {"/proc/self/status"}
         node.close()
 
 

@@ -113,11 +113,10 @@ def test_a_node_that_ended_well_is_not_missed() -> None:
 
 
 def test_the_shared_memory_of_a_process_is_told() -> None:
-    memory = {"off": "", "locked_bytes": 9_000_000, "host_bytes": 18_000_000}
+    memory = {"off": "", "locked_bytes": 9_000_000}
     status = NodeStatus("router", "routing", "h", 1, 1, detail={"net": {"shared_memory": memory}})
     found = parsed(exposition([row(status, "router")], {}, 0))
     assert found["vla_zenoh_shared_memory_locked_bytes"][0].value == 9e6
-    assert found["vla_zenoh_shared_memory_host_bytes"][0].value == 18e6
 
 
 def test_names_of_strangers_do_not_grow_the_metrics_without_bound() -> None:

@@ -166,10 +166,8 @@ def _of_links(out: _Families, node: dict[str, str], detail: Mapping[str, Any]) -
             labels = {**node, "key": str(key)}
             out.add(gauge, "sent_hertz", "Records published.", labels, pair[0], "hertz")
             out.add(gauge, "sent_bytes", "Published per second.", labels, pair[1], "bytes")
-    for name, value in _numbers(net.get("shared_memory")):  # locked_bytes, host_bytes
-        out.add(
-            gauge, f"shared_memory_{name}", "Of the process, of the host.", node, value, "bytes"
-        )
+    for name, value in _numbers(net.get("shared_memory")):  # locked_bytes
+        out.add(gauge, f"shared_memory_{name}", "Of the process.", node, value, "bytes")
     for key, count in _numbers(net.get("lost")):
         labels = {**node, "key": key}
         out.add(CounterMetricFamily, "lost_records", "Never arrived here.", labels, count)
