@@ -27,7 +27,7 @@ from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Command, Reading
-from vla_zenoh.runtime.process import INNER_PRIORITY
+from vla_zenoh.runtime.process import INNER_PRIORITY, realtime_links
 from vla_zenoh.types import FloatArray, JointCommand
 from vla_zenoh_franka.hand import Hand
 from vla_zenoh_franka.plugin import FrankaOptions
@@ -138,7 +138,8 @@ class FrankaArm:
                 "Desk? Is no other program connected?"
             ) from error
         self._update(self.robot.state)
-        threading.Thread(target=self._hold, name="hold", daemon=True).start()
+        with realtime_links():  # it shares a lock and the GIL with the loop
+            threading.Thread(target=self._hold, name="hold", daemon=True).start()
 
     def close(self) -> None:
         """End the loop and disconnect."""

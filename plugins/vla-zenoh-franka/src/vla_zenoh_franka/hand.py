@@ -7,6 +7,7 @@ import time
 from typing import Any, NamedTuple
 
 from vla_zenoh.errors import in_words
+from vla_zenoh.runtime.process import realtime_links
 
 CLEARLY_M = 0.002
 """Less is not a closing motion; fingers further than this from the request hold an object; so do
@@ -52,8 +53,9 @@ class Hand:
             threading.Thread(target=body, name=f"hand {name}", daemon=True)
             for name, body in (("motions", self._run), ("state", self._watch))
         ]
-        for thread in self._threads:
-            thread.start()
+        with realtime_links():  # they share the GIL with the arm's loop
+            for thread in self._threads:
+                thread.start()
 
     def ask(self, width_m: float, speed_m_s: float, force_n: float) -> None:
         """Replace the newest request; returns at once."""

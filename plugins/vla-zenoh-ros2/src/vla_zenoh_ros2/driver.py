@@ -22,7 +22,7 @@ from vla_zenoh.profile.robot import Ros2Profile
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
 from vla_zenoh.robots.joint_reading import SimulatedClock
-from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
+from vla_zenoh.runtime.process import ROUTER_PATIENCE_S, realtime_links
 from vla_zenoh.types import Event
 from vla_zenoh.types.records import JointReference, PoseReference
 from vla_zenoh_ros2.arm import NAME, Ros2Arm
@@ -157,14 +157,15 @@ class Ros2Driver(RobotDriver):
 
     def connect(self) -> None:
         """Start the threads of cameras, operators' topics and what watches the middleware."""
-        threaded = (*self._cameras, self._operators, self._middleware, self._frames)
-        bodies = [each.run for each in threaded if each is not None]
-        self._threads = [
-            threading.Thread(target=body, args=(self._halt,), name=f"ros2 {index}", daemon=True)
-            for index, body in enumerate(bodies)
-        ]
-        for thread in self._threads:
-            thread.start()
+        watchers = (self._operators, self._middleware, self._frames)
+        with realtime_links():  # they share the GIL with the arm's loop
+            self._threads = [self._start(each.run) for each in watchers if each is not None]
+        self._threads += [self._start(camera.run) for camera in self._cameras]
+
+    def _start(self, body: Callable[[threading.Event], None]) -> threading.Thread:
+        thread = threading.Thread(target=body, args=(self._halt,), name="ros2", daemon=True)
+        thread.start()
+        return thread
 
     def close(self) -> None:
         """Stop the threads and leave the ROS graph."""
