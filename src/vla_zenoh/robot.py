@@ -112,9 +112,9 @@ class Robot(Protocol):
 
 
 def numbers(name: str, given: ArrayLike, count: int) -> FloatArray:
-    """`given` as a (count,) array of float64, which may contain NaN; else a `ValueError`."""
+    """A copy of `given`, (count,) of float64, which may contain NaN; else a `ValueError`."""
     try:
-        array = np.asarray(given, np.float64)
+        array = np.array(given, np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is not a list of numbers: {error}") from error
     if array.shape != (count,):

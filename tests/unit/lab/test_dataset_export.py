@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +35,7 @@ from dataset_rig import (
 from dataset_rig import write_run as make_run
 from made_arm import made_arm
 from typed import typed
-from vla_zenoh_dataset.episodes import episodes_of, fps_of
+from vla_zenoh_dataset.episodes import RecordedEpisode, episodes_of, fps_of
 from vla_zenoh_dataset.features import (
     Histogram,
     action_names,
@@ -217,13 +219,66 @@ def test_an_episode_begins_with_the_first_image_and_shows_none_of_the_future(
     assert written.frames == sum(whole) - missed
 
 
-def test_an_episode_without_any_image_of_a_camera_is_named(run_file: Path, tmp_path: Path) -> None:
-    episodes = episodes_of(load_run(run_file))
-    first = next(iter(pictures(episodes[0].run.file, "front")))
+Cut = Callable[[RecordedEpisode], None]
+
+
+def _before_the_first_image(episode: RecordedEpisode) -> None:
+    first = next(iter(pictures(episode.run.file, "front")))
     before_ns = first.stamp_ns - 1_000_000
-    episodes[1].frames = [replace(frame, stamp_ns=before_ns) for frame in episodes[1].frames]
-    with pytest.raises(RecordingError, match=r"ended before the first image.*--camera"):
-        export(tmp_path / "out", episodes, ["front"], PARTS)
+    episode.frames = [replace(frame, stamp_ns=before_ns) for frame in episode.frames]
+
+
+def _beyond_the_last_image(episode: RecordedEpisode) -> None:
+    *frames, last = episode.frames
+    episode.frames = [*frames, replace(last, stamp_ns=last.stamp_ns + 10**10)]
+
+
+def _without_states(episode: RecordedEpisode) -> None:
+    begin_ns, end_ns = (episode.frames[at].stamp_ns for at in (5, 9))
+    poses = [
+        each for each in episode.run.poses if not begin_ns < each.header.stamp_wall_ns < end_ns
+    ]
+    episode.run = replace(episode.run, poses=poses)
+
+
+@pytest.mark.parametrize(
+    ("cut", "why"),
+    [
+        (_before_the_first_image, "ended before the first image"),
+        (_beyond_the_last_image, r"no images of camera 'front' within 0.5 s before its frame at "),
+        (_without_states, r"no state/pose within 100 ms of its frame at "),
+    ],
+)
+def test_an_episode_with_a_gap_is_left_out_by_name_and_the_others_are_written(
+    cut: Cut, why: str, run_file: Path, tmp_path: Path
+) -> None:
+    first, second = episodes_of(load_run(run_file))
+    cut(first)
+    written = export(tmp_path / "out", [first, second], ["front"], PARTS)
+    (gap,) = written.left_out
+    assert re.search(rf"teach.mcap: the episode at \d\.\d s .*{why}", gap)
+    alone = export(tmp_path / "alone", [second], ["front"], PARTS)
+    assert (written.episodes, written.frames) == (1, alone.frames)
+    np.testing.assert_array_equal(states(tmp_path / "out"), states(tmp_path / "alone"))
+    with pytest.raises(RecordingError, match=rf"without a gap: .*{why}.*--camera"):
+        export(tmp_path / "none", [first], ["front"], PARTS)
+
+
+def test_what_was_left_out_is_said(
+    run_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "gappy.mcap"
+    gappy = RecordingWriter(path, KEYS, profile_yaml=PROFILE, base_frame="base", began_ns=ZERO_NS)
+    for sample in load_run(run_file).file.entries():
+        gone = 1e9 < sample.received_ns - ZERO_NS < 2e9
+        if not (gone and sample.key == KEYS.camera_jpeg("front")):
+            gappy.write(sample)
+    gappy.finish({"dropped": {}})
+    done = typed(capsys, "dataset", "export", str(path), "-o", str(tmp_path / "out"), "--json")
+    said = json.loads(done.stdout)
+    assert (done.code, said["episodes"]) == (0, 1)
+    (gap,) = said["left_out"]
+    assert f"left out: {gap}" in done.said.replace("\n", " ")
 
 
 def test_info_names_and_types_what_the_spec_declares(dataset: Path) -> None:

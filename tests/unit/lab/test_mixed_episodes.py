@@ -89,13 +89,14 @@ def test_the_persons_frames_are_what_the_arm_was_asked_for_in_the_models_numbers
         ({"rotation": "quaternion"}, [1, 3, 4, 5, 6], [WAY_M, 0, 0, 0, 1]),
         ({"gripper": "delta_m"}, [1], [WAY_M]),
         ({"gripper": "open_fraction", "gripper_open_is_high": False}, [1], [WAY_M]),
+        ({"kind": "velocity", "rotation": "rotvec"}, [1], [WAY_M / DT_S]),
     ],
 )
 def test_they_are_told_in_the_words_of_every_spec(
     action: dict[str, Any], columns: list[int], wanted: list[float], tmp_path: Path
 ) -> None:
     actions = np.array([frame.action for frame in mixed(tmp_path, **action).frames])[LED]
-    scale = 1 / action.get("position_scale_m", 1.0)
+    scale = 1 / action.get("position_scale_m", DT_S if action.get("kind") == "velocity" else 1.0)
     for column, value in zip(columns, wanted, strict=True):
         np.testing.assert_allclose(actions[:, column], value, atol=ATOL + scale * PERIOD_M)
 

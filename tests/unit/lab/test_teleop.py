@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -407,6 +408,35 @@ def test_a_leader_that_cannot_be_read_is_named(tmp_path: Path) -> None:
             leader.path()
     finally:
         leader.close()
+
+
+def _path(leader: LeaderArm) -> list[LeaderState]:
+    try:
+        return leader.path()
+    except PeerError:  # before its first reading
+        return []
+
+
+def test_a_leader_that_fills_one_array_again_and_again_has_a_path(tmp_path: Path) -> None:
+    file = tmp_path / "filled.py"
+    file.write_text(
+        "import numpy as np\n"
+        "from vla_zenoh.robot import Reading\n"
+        "class Filled:\n"
+        "    position_rad = np.zeros(7)\n"
+        "    def read(self):\n"
+        "        self.position_rad += 0.01\n"
+        "        return Reading(self.position_rad)\n"
+        "    def move(self, command): pass\n"
+    )
+    leader = LeaderArm(file, {}, 7)
+    try:
+        while len(path := _path(leader)) < 5:
+            time.sleep(DT_S)
+        turned_rad = [state.position_rad[0] for state in path]
+    finally:
+        leader.close()
+    np.testing.assert_allclose(np.diff(turned_rad), 0.01, atol=ATOL)
 
 
 # -- devices -------------------------------------------------------------------------------------

@@ -123,6 +123,8 @@ def export(
             rotation=rotation,
         )
     written = written._replace(folder=output)
+    for gap in written.left_out:
+        warn(f"left out: {gap}")
     if as_json:
         print_json(written._asdict())
         return

@@ -38,7 +38,7 @@ class CommandedMotion:
     are those commanded; where poses were commanded, the measured ones.
 
     Args:
-        spec: of the actions; deltas are added to the step before.
+        spec: of the actions; deltas are added to the step before, velocities are those of a step.
 
     Raises:
         RecordingError: such actions cannot be made of a motion.
@@ -70,6 +70,8 @@ class CommandedMotion:
                 arm = arm - self._joints(since_ns)
         else:
             arm = self._way(self._pose(since_ns), self._pose(until_ns))
+        if spec.kind == "velocity":
+            arm = np.divide(arm, spec.dt_s)
         gripper = () if spec.gripper == "none" else (self._gripper(since_ns, until_ns),)
         return np.array([*arm, *gripper], np.float32)
 

@@ -33,6 +33,10 @@ from vla_zenoh_dataset.label import EpisodeLabel
 FPS_TOLERANCE = 0.01
 
 
+class EpisodeGap(RecordingError):
+    """Something was not recorded while one episode lasted; others may have it."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeFrame:
     """One time step. `action`: (D,) float32, with the meaning of the spec."""
@@ -74,6 +78,15 @@ class RecordedEpisode:
         if self.success is None:
             return EpisodeLabel.UNKNOWN
         return EpisodeLabel.SUCCESS if self.success else EpisodeLabel.FAILURE
+
+    @property
+    def named(self) -> str:
+        """Which one it is, in words: when it began, of which recording."""
+        return f"{self.run.path}: the episode at {self.after_s(self.since_ns):.1f} s"
+
+    def after_s(self, at_ns: int) -> float:
+        """Seconds from the beginning of the recording to a time, wall clock."""
+        return (at_ns - self.run.began_ns) / 1e9
 
     @property
     def workers(self) -> list[str]:

@@ -35,7 +35,7 @@ from vla_zenoh.policy.meaning import ROTATION_FORMS, joints_as, unturned, wrappe
 from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Task
-from vla_zenoh_dataset.episodes import RecordedEpisode, endless_joints
+from vla_zenoh_dataset.episodes import EpisodeGap, RecordedEpisode, endless_joints
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 LEAST_SPREAD = 1e-6
@@ -309,7 +309,8 @@ def states_of(episode: RecordedEpisode, numbers: Mapping[str, StateNumbers]) -> 
         numbers: of every part, see `numbers_of`; the same for all episodes of a data set.
 
     Raises:
-        RecordingError: no state was recorded near a frame, or one of other joints.
+        EpisodeGap: no state was recorded near a frame.
+        RecordingError: one of other joints, or without a part.
     """
     each = [_states(episode, episode.run.of_part(part), own) for part, own in numbers.items()]
     return np.concatenate(each, axis=1)
@@ -375,8 +376,9 @@ def _states(episode: RecordedEpisode, run: Run, numbers: StateNumbers) -> NDArra
         for part, stream in wanted.items():
             near = nearest(stream, frame.stamp_ns)
             if near is None or abs(near.header.stamp_wall_ns - frame.stamp_ns) > NEAR_NS:
-                raise RecordingError(
-                    f"{run.path}: no {place}state/{part} within {NEAR_NS / 1e6:g} ms of a frame"
+                raise EpisodeGap(
+                    f"{episode.named} has no {place}state/{part} within {NEAR_NS / 1e6:g} ms of "
+                    f"its frame at {episode.after_s(frame.stamp_ns):.1f} s"
                 )
             name = FIELD_OF.get(part, part)
             found[name] = near.record if part in streams else getattr(near.record, name)

@@ -19,12 +19,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from vla_zenoh_policy_servers.state_vector import StateNumbers
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.lab.video import CODEC, PIXEL_FORMAT
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh_dataset.episodes import RecordedEpisode, fps_of
+from vla_zenoh_dataset.episodes import EpisodeGap, RecordedEpisode, fps_of
 from vla_zenoh_dataset.features import (
     ACTION,
     INTERVENTION,
@@ -47,8 +48,8 @@ from vla_zenoh_dataset.videos import (
     DepthColumn,
     EpisodeVideo,
     chosen,
-    from_first_image,
     stamps_of,
+    with_images,
     write_videos,
 )
 
@@ -65,7 +66,12 @@ COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
 class Written(NamedTuple):
-    """Result of an export. `successes`: number of successful episodes; None if unknown for all."""
+    """Result of an export.
+
+    Args:
+        successes: number of successful episodes; None if unknown for all.
+        left_out: episodes of which something was not recorded, and what.
+    """
 
     folder: Path
     episodes: int
@@ -77,6 +83,7 @@ class Written(NamedTuple):
     successes: int | None
     interventions: int
     labels: Mapping[str, int]
+    left_out: tuple[str, ...]
 
 
 def export(
@@ -92,7 +99,8 @@ def export(
     """Write a dataset.
 
     An episode begins with the first frame for which every camera has an image: one that is shown
-    nothing newer than a policy could have seen.
+    nothing newer than a policy could have seen. Episodes in which images or states are missing are
+    left out.
 
     Args:
         folder: must not exist, or be empty.
@@ -103,7 +111,7 @@ def export(
 
     Raises:
         RecordingError: the folder is not empty; there are no episodes; their actions differ in
-            meaning, or their grippers in width; a part of them was not recorded; they turn the
+            meaning, or their grippers in width; none was recorded without a gap; they turn the
             hand, and `rotation` is False.
     """
     if not episodes:
@@ -118,8 +126,23 @@ def export(
         check_never_turns(episodes)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RecordingError(f"{folder} is there already; give --output a new folder")
-    seen = from_first_image(episodes, cameras, depth)
-    return _Dataset(folder, seen, cameras, parts, depth, rotation=rotation).write(progress)
+    kept, gaps = with_images(episodes, cameras, depth)
+    # One meaning for all runs, whatever their profiles say of joint order and home.
+    numbers = numbers_of(episodes[0], parts)
+    whole: dict[int, NDArray[np.float32]] = {}
+    for index, episode in enumerate(kept):
+        try:
+            whole[index] = states_of(episode, numbers)
+        except EpisodeGap as gap:
+            gaps.append(str(gap))
+    if not whole:
+        raise RecordingError(
+            f"no episode was recorded without a gap: {gaps[0]}. Leave what is missing out with "
+            "--camera or --state"
+        )
+    seen = [kept[index] for index in whole], [*whole.values()], numbers
+    made = _Dataset(folder, seen, cameras, parts, depth, rotation=rotation)
+    return made.write(progress)._replace(left_out=tuple(gaps))
 
 
 def _step(episode: RecordedEpisode) -> dict[str, ActionSpec]:
@@ -132,23 +155,21 @@ class _Dataset:
     def __init__(
         self,
         root: Path,
-        episodes: Sequence[RecordedEpisode],
+        seen: tuple[list[RecordedEpisode], list[NDArray[np.float32]], dict[str, StateNumbers]],
         cameras: Sequence[str],
         parts: Sequence[str],
         depth: Sequence[str],
         *,
         rotation: bool,
     ) -> None:
-        self._root, self._episodes = root, list(episodes)
+        self._root = root
+        self._episodes, self._states, self._numbers = seen
         self._cameras, self._parts = tuple(cameras), parts
         self._depths = [DepthColumn(camera) for camera in depth]
-        self._spec = episodes[0].spec
+        self._spec = self._episodes[0].spec
         self._rotation = rotation
         self._columns = kept_columns(self._spec.action, rotation=rotation)
         self._fps = fps_of(self._spec.action)
-        # One meaning for all runs, whatever their profiles say of joint order and home.
-        self._numbers = numbers_of(episodes[0], parts)
-        self._states = [states_of(episode, self._numbers) for episode in self._episodes]
         self._state_names = names_of_state(self._numbers, self._spec.action)
         self._tasks = list(
             dict.fromkeys(frame.prompt for episode in self._episodes for frame in episode.frames)
@@ -176,6 +197,7 @@ class _Dataset:
             sum(known) if known else None,
             sum(int(each[INTERVENTION].sum()) for each in rows),
             dict(Counter(episode.label.value for episode in self._episodes)),
+            (),
         )
 
     def _place(self, pattern: str, number: int, **more: str) -> Path:

@@ -17,7 +17,7 @@ from vla_zenoh.lab.recording.run import Run, depths, pictures
 from vla_zenoh.lab.recording.sample import Sample
 from vla_zenoh.lab.video import VideoWriter
 from vla_zenoh.types import Depth
-from vla_zenoh_dataset.episodes import RecordedEpisode
+from vla_zenoh_dataset.episodes import EpisodeGap, RecordedEpisode
 from vla_zenoh_dataset.features import PICTURE, Histogram
 
 OPTIONS = {"crf": "18", "g": "2", "bf": "0"}
@@ -30,30 +30,43 @@ def stamps_of(run: Run, camera: str) -> list[int]:
     return [picture.stamp_ns for picture in pictures(run.file, camera)]
 
 
-def from_first_image(
+def with_images(
     episodes: Sequence[RecordedEpisode], cameras: Sequence[str], depth: Sequence[str]
-) -> list[RecordedEpisode]:
-    """The same episodes, each from the first frame for which every camera has an image.
+) -> tuple[list[RecordedEpisode], list[str]]:
+    """Episodes with an image of every camera at every frame, each from its first such frame.
+
+    Returns:
+        them, and why each of the others is left out.
 
     Raises:
-        RecordingError: no frame of an episode is left.
+        RecordingError: a recording has no image of a camera.
     """
-    readers = [(pictures, camera) for camera in cameras] + [(depths, camera) for camera in depth]
-    begins_ns: dict[int, int] = {}
-    kept = []
+    readers = [(pictures, camera, "images") for camera in cameras]
+    readers += [(depths, camera, "depth images") for camera in depth]
+    found: dict[int, list[list[int]]] = {}
+    kept, gaps = list[RecordedEpisode](), list[str]()
     for episode in episodes:
-        run = episode.run
-        if id(run) not in begins_ns:
-            firsts = [next(iter(read(run.file, camera)), None) for read, camera in readers]
-            begins_ns[id(run)] = max((each.stamp_ns for each in firsts if each), default=0)
-        frames = [frame for frame in episode.frames if frame.stamp_ns >= begins_ns[id(run)]]
-        if not frames:
-            raise RecordingError(
-                f"{run.path}: an episode ended before the first image of one of its cameras; leave "
-                "the camera out with --camera, or the recording"
-            )
-        kept.append(replace(episode, frames=frames))
-    return kept
+        file = episode.run.file
+        if id(file) not in found:
+            found[id(file)] = [
+                [each.stamp_ns for each in read(file, camera)] for read, camera, _ in readers
+            ]
+        stamps = found[id(file)]
+        begins_ns = max((each[0] for each in stamps if each), default=0)
+        frames = [frame for frame in episode.frames if frame.stamp_ns >= begins_ns]
+        whole = replace(episode, frames=frames)
+        try:
+            if not frames:
+                raise EpisodeGap(
+                    f"{episode.named} ended before the first image of one of its cameras"
+                )
+            for (_, camera, kind), each in zip(readers, stamps, strict=True):
+                chosen(whole, camera, each, kind)
+        except EpisodeGap as gap:
+            gaps.append(str(gap))
+        else:
+            kept.append(whole)
+    return kept, gaps
 
 
 def chosen(
@@ -62,25 +75,25 @@ def chosen(
     """Number of the newest image captured before each frame.
 
     Raises:
-        RecordingError: no image, or only one that is too old.
+        EpisodeGap: there is none for a frame, or only one that is too old.
+        RecordingError: the recording has no image.
     """
     # One that came after a newer one is left out, as a worker leaves it out.
     newest = [-1, *accumulate(stamps, max)]
     order = [index for index, stamp in enumerate(stamps) if stamp > newest[index]]
     in_time = [stamps[index] for index in order]
+    if not in_time:
+        there = ", ".join(sorted(episode.run.picture_counts)) or "none"
+        raise RecordingError(
+            f"{episode.run.path} has no {kind} of camera {camera!r}; it has images of: {there}"
+        )
     out = []
     for frame in episode.frames:
         at = bisect_right(in_time, frame.stamp_ns) - 1
         if at < 0 or frame.stamp_ns - in_time[at] > OLDEST_NS:
-            if not in_time:
-                there = ", ".join(sorted(episode.run.picture_counts)) or "none"
-                raise RecordingError(
-                    f"{episode.run.path} has no {kind} of camera {camera!r}; it has images of: "
-                    f"{there}"
-                )
-            raise RecordingError(
-                f"{episode.run.path}: no {kind} of camera {camera!r} within "
-                f"{OLDEST_NS / 1e9:g} s before a frame; leave the camera out with --camera"
+            raise EpisodeGap(
+                f"{episode.named} has no {kind} of camera {camera!r} within "
+                f"{OLDEST_NS / 1e9:g} s before its frame at {episode.after_s(frame.stamp_ns):.1f} s"
             )
         out.append(order[at])
     return out
