@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("models/*/*.md")])
+FOLDERS = ("*.md", "docs/**/*.md", "models/*/*.md")
+PAGES = {page: page.read_text("utf-8") for folder in FOLDERS for page in ROOT.glob(folder)}
 LINK = re.compile(r"\]\(([^)\s#]+)(#[\w-]+)?\)")
 FILE = re.compile(r"`((?:[\w-]+/)+[\w.-]+\.(?:py|yaml|md|c))`")
 BARE = re.compile(r"`(\w+\.py)`")
@@ -16,20 +18,19 @@ ABOUT_OUR_FILES = (ROOT / "CONTRIBUTING.md", ROOT / "docs" / "design.md")
 BASES = (ROOT, ROOT / "src" / "vla_zenoh")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_link_leads_to_a_file(page: Path) -> None:
-    links = [found[1] for found in LINK.finditer(page.read_text("utf-8"))]
-    local = [link for link in links if not re.match(r"\w+:", link)]
-    assert [link for link in local if not (page.parent / link).exists()] == []
+def test_every_link_leads_to_a_file() -> None:
+    links = [(page, found[1]) for page, text in PAGES.items() for found in LINK.finditer(text)]
+    local = [(page, link) for page, link in links if not re.match(r"\w+:", link)]
+    assert [(page, link) for page, link in local if not (page.parent / link).exists()] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_file_that_is_named_exists(page: Path) -> None:
-    named = {found[1] for found in FILE.finditer(page.read_text("utf-8"))}
-    missing = {name for name in named if not any((base / name).exists() for base in BASES)}
-    assert {name for name in missing if not name.startswith(("runs/", "reference/"))} == set()
+def test_every_file_that_is_named_exists() -> None:
+    named = [(page, found[1]) for page, text in PAGES.items() for found in FILE.finditer(text)]
+    missing = [each for each in named if not any((base / each[1]).exists() for base in BASES)]
+    assert [each for each in missing if not each[1].startswith(("runs/", "reference/"))] == []
 
 
+@cache
 def anchors(page: Path) -> set[str]:
     headings = re.findall(r"^#+ (.+)$", page.read_text("utf-8"), re.MULTILINE)
     given = {found for each in headings for found in re.findall(r"{(#[\w-]+)}", each)}
@@ -37,11 +38,10 @@ def anchors(page: Path) -> set[str]:
     return given | {"#" + re.sub(r"\s+", "-", each) for each in plain}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_link_leads_to_a_heading(page: Path) -> None:
-    text = page.read_text("utf-8")
-    for file, anchor in re.findall(r"\]\(([\w./-]*\.md)?(#[\w-]+)\)", text):
-        assert anchor in anchors(page.parent / file if file else page), (file, anchor)
+def test_every_link_leads_to_a_heading() -> None:
+    for page, text in PAGES.items():
+        for file, anchor in re.findall(r"\]\(([\w./-]*\.md)?(#[\w-]+)\)", text):
+            assert anchor in anchors(page.parent / file if file else page), (page, file, anchor)
 
 
 @pytest.mark.parametrize("page", ABOUT_OUR_FILES, ids=lambda page: page.stem)

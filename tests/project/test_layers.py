@@ -85,9 +85,13 @@ def allowed(path: Path) -> frozenset[str]:
 
 
 @cache
+def walked(source: str) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(ast.parse(source)))
+
+
 def imported_names(source: str) -> set[str]:
     names: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in walked(source):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -109,7 +113,7 @@ def test_where_the_tcp_may_be_is_read_in_one_place() -> None:
         path.name
         for path in (*PACKAGE.rglob("*.py"), *(ROOT / "plugins").rglob("*.py"))
         if "limits.workspace" in (source := path.read_text())
-        for node in ast.walk(ast.parse(source))
+        for node in walked(source)
         if isinstance(node, ast.Attribute) and ast.unparse(node).endswith("limits.workspace")
     }
     assert readers == set()
@@ -123,31 +127,28 @@ def test_the_map_of_control_has_every_module_once() -> None:
 
 
 OF_THE_PACKAGE = ("vla_zenoh.__version__", "vla_zenoh.lazy_names")
-SOURCES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
+SOURCES = {path.relative_to(PACKAGE): path.read_text() for path in sorted(PACKAGE.rglob("*.py"))}
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=str)
-def test_a_module_imports_only_what_its_layer_may(path: Path) -> None:
-    assert offences((PACKAGE / path).read_text(), IO - allowed(path)) == []
+def test_a_module_imports_only_what_its_layer_may() -> None:
+    found = {path: offences(source, IO - allowed(path)) for path, source in SOURCES.items()}
+    assert {path: names for path, names in found.items() if names} == {}
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=str)
-def test_a_module_imports_no_folder_above_its_own(path: Path) -> None:
-    here = path.parts[0].removesuffix(".py")
-    if here == "__init__":
-        return
-    ours = {
-        name
-        for name in imported_names((PACKAGE / path).read_text())
-        if name.startswith("vla_zenoh.")
-        and name not in ("vla_zenoh.__version__", "vla_zenoh.lazy_names")
-    }
-    assert {name for name in ours if LEVEL[room(name)] > LEVEL[here]} == set()
+def test_a_module_imports_no_folder_above_its_own() -> None:
+    above = [
+        (path, name)
+        for path, source in SOURCES.items()
+        if (here := path.parts[0].removesuffix(".py")) != "__init__"
+        for name in imported_names(source)
+        if name.startswith("vla_zenoh.") and name not in OF_THE_PACKAGE
+        if LEVEL[room(name)] > LEVEL[here]
+    ]
+    assert above == []
 
 
 OUTSIDE = ("lab", "program", "__main__")
 """What is not the core: the lab, and the program that has commands of both."""
-CORE = [path for path in SOURCES if path.parts[0].removesuffix(".py") not in OUTSIDE]
 OF_THE_LAB = re.compile(r"(vla_zenoh\.)?lab\.[A-Za-z_.]+(:[a-z_]+)?")
 
 
@@ -155,15 +156,19 @@ def names_of_the_lab(source: str) -> set[str]:
     """Modules of the lab that a file imports, or names in a string for a later import."""
     texts = {
         node.value
-        for node in ast.walk(ast.parse(source))
+        for node in walked(source)
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
     return {name for name in texts | imported_names(source) if OF_THE_LAB.fullmatch(name)}
 
 
-@pytest.mark.parametrize("path", CORE, ids=str)
-def test_no_module_of_the_core_imports_the_lab_at_any_time(path: Path) -> None:
-    assert names_of_the_lab((PACKAGE / path).read_text()) == set()
+def test_no_module_of_the_core_imports_the_lab_at_any_time() -> None:
+    found = {
+        path: names_of_the_lab(source)
+        for path, source in SOURCES.items()
+        if path.parts[0].removesuffix(".py") not in OUTSIDE
+    }
+    assert {path: names for path, names in found.items() if names} == {}
 
 
 @pytest.mark.parametrize(
@@ -192,7 +197,7 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
     waiting = {
         name: {
             found
-            for imported in imported_names((PACKAGE / path).read_text())
+            for imported in imported_names(SOURCES[path])
             if (found := imported if imported in modules else imported.rpartition(".")[0])
             in modules
         }
