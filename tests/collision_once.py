@@ -1,4 +1,4 @@
-"""Which links of an arm come near each other, found once for all tests of a process.
+"""What an arm's collision shapes give, found once for all tests of a process.
 
 It takes a fifth of a second for a Panda, and hundreds of tests make one.
 """
@@ -10,26 +10,43 @@ from typing import Any
 
 import numpy as np
 
+from vla_zenoh.kinematics import collision
 from vla_zenoh.kinematics.collision import CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics
 
 
 def remember_distances() -> None:
     """From now on, of arms that are the same in every number."""
-    for name in ("_at", "_comes_near"):
-        setattr(CollisionModel, name, _once(getattr(CollisionModel, name)))
+    collision._one_hull_a_link = _copied(_once(collision._one_hull_a_link, _arm))
+    CollisionModel._at = _in_two(_once(CollisionModel._at, _shapes))
+    CollisionModel._comes_near = _once(CollisionModel._comes_near, _shapes)
 
 
-def _once(find: Callable[..., Any]) -> Callable[..., Any]:
+def _once(find: Callable[..., Any], of: Callable[[Any], Iterator[Any]]) -> Callable[..., Any]:
     found: dict[Any, Any] = {}
 
-    def once(self: Any, *asked: Any) -> Any:
-        key = (*map(_bytes, asked), self._model.saveToString(), *_shapes(self))
+    def once(one: Any, *asked: Any) -> Any:
+        key = (*map(_bytes, asked), *of(one))
         if key not in found:
-            found[key] = find(self, *asked)
+            found[key] = find(one, *asked)
         return found[key]
 
     return once
+
+
+def _copied(find: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda one: find(one).copy()
+
+
+def _in_two(find: Callable[..., Any]) -> Callable[..., Any]:
+    """The samples, which are the same for every home, and the home behind them."""
+
+    def at(one: Any, samples_rad: Any, pairs: Any) -> Any:
+        count = collision.SAMPLES
+        parts = [part for part in (samples_rad[:count], samples_rad[count:]) if len(part)]
+        return np.concatenate([find(one, part, pairs) for part in parts])
+
+    return at
 
 
 def _bytes(asked: Any) -> bytes:
@@ -38,7 +55,15 @@ def _bytes(asked: Any) -> bytes:
     return np.asarray(asked).tobytes()
 
 
+def _arm(kinematics: Kinematics) -> Iterator[Any]:
+    yield kinematics.urdf
+    yield kinematics.urdf.read_bytes()
+    yield kinematics.arm_joints
+    yield kinematics.locked_position.tobytes()
+
+
 def _shapes(model: Any) -> Iterator[Any]:
+    yield model._model.saveToString()
     for shape in model._geometry.geometryObjects:
         points = getattr(shape.geometry, "points", list)()
         place = shape.placement.homogeneous.tobytes()

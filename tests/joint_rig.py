@@ -17,6 +17,7 @@ from vla_zenoh.profile import Profile, override
 from vla_zenoh.types import FloatArray, JointCommand
 
 BOX_M = 1e-3
+STANDS_RAD = 1e-9
 
 
 def panda(command: str = "joint", **parts: Any) -> Profile:
@@ -114,9 +115,13 @@ class Joints:
         self.settle(goal_rad)
 
     def settle(self, joints_rad: FloatArray, duration_s: float = 2.0) -> None:
+        """Ask for the same until the arm stands, so long at most."""
         for _ in range(round(duration_s / 0.4)):
+            before_rad = self.joints_rad.copy()
             self.send(*[self.columns(joints_rad)] * 8)
             self.run(0.4)
+            if np.abs(self.joints_rad - before_rad).max() < STANDS_RAD:
+                return
 
     def is_free(self, goal_rad: FloatArray) -> bool:
         """Whether no bound is near on the straight way there."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -15,27 +14,9 @@ from panda_arm import ARM_JOINTS, HOME_RAD, swivelled
 
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.limits import workspace_corners
-from vla_zenoh.kinematics import collision
-from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.types import FloatArray, JointState, Stamped
 
 EXACT_RAD = 1e-6
-
-
-@pytest.fixture(scope="module", autouse=True)
-def hulls_once() -> Iterator[None]:
-    """The hulls of an arm's links are made once in this file: those of an SO-101 take a second."""
-    make, made = collision._one_hull_a_link, dict[Any, Any]()
-
-    def once(kinematics: Kinematics) -> Any:
-        arm = (kinematics.urdf, kinematics.arm_joints)
-        if arm not in made:
-            made[arm] = make(kinematics)
-        return made[arm].copy()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collision, "_one_hull_a_link", once)
-        yield
 
 
 def test_absolute_joints_are_reached_exactly() -> None:
