@@ -54,6 +54,8 @@ AT_THE_END_OF_EACH := $(if $(filter output-sync,$(.FEATURES)),--output-sync=targ
 test: $(READY) ## Run the tests that take up to six seconds each
 	@$(MAKE) --no-print-directory --keep-going --jobs 2 $(AT_THE_END_OF_EACH) test-realtime test-computed
 
+# Two processes on two cores: threads of NumPy's library would only wait for each other.
+test-computed: export OMP_NUM_THREADS := 1
 test-computed: $(READY)
 	nice -n 10 $(BIN)/python -m pytest -n auto $(FILES) -m "$(SUITE) and $(WHICH) and not realtime" $(ARGS) || [ $$? = 5 ]
 
