@@ -133,7 +133,7 @@ def begin(
     return loop
 
 
-def moving(seconds: float = 1.4, prompt: str = UP, rate_hz: float = RATE_HZ) -> Lockstep:
+def moving(seconds: float = 1.2, prompt: str = UP, rate_hz: float = RATE_HZ) -> Lockstep:
     """A loop whose arm is in full motion."""
     loop = begin(prompt, rate_hz)
     loop.run(seconds)

@@ -37,9 +37,9 @@ from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseReferen
 
 EXACT_M = 1e-3
 SLIP_M = 1e-3
-TOGGLES_S = 5.0
+TOGGLES_S = 3.0
 MOVES_M_S, TOGGLED_WAY_M = 0.02, 0.3
-GRIPPER_S = 6.0
+GRIPPER_S = 4.0
 STALL_S = 1.0
 
 
@@ -172,8 +172,8 @@ def test_active_toggled_ten_times_a_second_stays_smooth() -> None:
     # Often, so that the arm is under way each time before it is told to stop again.
     loop = begin(UP, rate_hz=30.0)
     for toggle in range(round(TOGGLES_S * 10)):
-        if toggle % 25 == 0:  # there and back, for the workspace ends
-            loop.put("prompt", UP if toggle % 50 == 0 else f"0 0 -{STEP_M}")
+        if toggle % 15 == 0:  # there and back, for the workspace ends
+            loop.put("prompt", UP if toggle % 30 == 0 else f"0 0 -{STEP_M}")
         loop.put("active", toggle % 2 == 1)
         loop.run(0.1)
     since = mark(loop)
@@ -196,7 +196,7 @@ def test_a_stop_while_something_is_held_does_not_drop_it() -> None:
     held = loop.world.objects()["brick"][0] - loop.world.tcp()[0]
     since = mark(loop)
     loop.put("stop")
-    loop.run(1.5)
+    loop.run(0.8)
     assert stop_time_s(loop, since) <= BRAKE[0]
     assert loop.world.gripper_state().holding
     slipped = loop.world.objects()["brick"][0] - loop.world.tcp()[0] - held

@@ -56,7 +56,7 @@ def test_without_robot_state_the_arm_stops() -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = dropped(*STATES)
-    loop.run(1.0)
+    loop.run(0.6)
     check_stop(loop, since, LOST)
     loop.tamper = None
     loop.run(0.3)
@@ -69,7 +69,7 @@ def test_a_state_that_is_said_again_and_again_stops_the_arm() -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = frozen(*STATES, payload_only=False)
-    loop.run(1.0)
+    loop.run(0.6)
     check_stop(loop, since, LOST)
     check_motion(loop)
 
@@ -78,7 +78,7 @@ def test_a_sensor_that_is_stuck_stops_the_arm() -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = frozen(PoseState, payload_only=True)
-    loop.run(1.0)
+    loop.run(0.7)
     check_stop(loop, since, FROZEN)
     check_motion(loop)
 
@@ -103,7 +103,7 @@ def test_a_measured_pose_that_jumps_far_stops_the_arm() -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = shifted(0.2)
-    loop.run(1.0)
+    loop.run(0.5)
     check_stop(loop, since, BRAKE)
     check_motion(loop)
 
@@ -255,7 +255,7 @@ def test_a_step_no_arm_can_make_is_not_begun() -> None:
     loop = moving()
     since = mark(loop)
     loop.put("prompt", "0 0 5")
-    loop.run(1.0)
+    loop.run(0.6)
     assert loop.refused["step_m"] > 0
     assert stop_time_s(loop, since) < 0.35
     assert speed_m_s(loop)[since:].max() < 1.15 * SPEED_M_S
