@@ -48,6 +48,7 @@ ERRORS = {
     "horizon": ("horizon", "a chunk of 8 steps, the spec says 1 to 4"),
     "shape": ("shape", r"steps have shape \(4, 6\), the spec says \(H, 7\)"),
     "objects": ("dtype", "steps are not numbers but object"),
+    "tensor": ("dtype", r"requires grad. Use tensor.detach\(\)"),
     "nan": ("not_finite", "NaN"),
     "millimetres": ("position_units", "are these metres"),
     "degrees": ("rotation_units", r"a step of 4\.96\d* rad, over 4 times the limit of 0\.2 rad"),

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vla_zenoh.errors import SpecError
+from vla_zenoh.errors import SpecError, in_words
 from vla_zenoh.policy.meaning import RotationForm, nearest_turn, toward, unturned, wrapped
 from vla_zenoh.policy.plan_clock import PlanClock, idle_time
 from vla_zenoh.policy.spec import ActionSpec, ModelSpec
@@ -160,8 +160,8 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
     """
     try:
         given = np.asarray(steps)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise SpecError(f"steps are not numbers: {error}", "dtype") from error
+    except Exception as error:  # tensors raise anything
+        raise SpecError(f"steps are not numbers: {in_words(error)}", "dtype") from error
     if given.dtype.kind not in "iuf":
         raise SpecError(f"steps are not numbers but {given.dtype}", "dtype")
     with np.errstate(over="ignore"):

@@ -21,7 +21,7 @@ from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
 from vla_zenoh.robots.joint_reading import JointReading
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
-from vla_zenoh.types.records import JointReference, Joints, PoseReference
+from vla_zenoh.types.records import JointReference, Joints, PoseReference, plain_values
 
 FUTURE_NS = 100_000_000
 MAX_WORDS = 300
@@ -154,7 +154,7 @@ class PythonDriver(RobotDriver):
             detail["width_m"] = width_m
         if self._complaint and not self.fault:
             detail["complaint"] = self._complaint
-        own = self._call("status") or {}
+        own = plain_values(self._call("status"))
         return DriverStatus({**detail, **own}, rates_hz={"readings": self._rate.rate_hz})
 
 

@@ -281,16 +281,19 @@ class InferenceDebug(Record):
     done: bool = False
 
 
-def plain_values(raw: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Raw output of a model as plain text, numbers and lists, of arrays of any library too; what is
-    too large or has no such form is described."""
-    return {str(name)[:256]: _plain(value, 2) for name, value in list((raw or {}).items())[:64]}
+def plain_values(given: Any) -> dict[str, Any]:
+    """What a model or a robot's class tells of itself as plain text, numbers and lists, of arrays
+    of any library too; what is too large or has no such form is described."""
+    if given is None:
+        return {}
+    named = given if isinstance(given, Mapping) else {"value": given}
+    return {str(name)[:256]: _plain(value, 2) for name, value in list(named.items())[:64]}
 
 
 def _plain(value: Any, depth: int) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
-    if value is None or isinstance(value, int):
+    if value is None or (isinstance(value, int) and value.bit_length() < 64):
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)

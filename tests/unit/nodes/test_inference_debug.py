@@ -7,13 +7,34 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
+from camera_rig import await_match, routed_session, until
 from vla_zenoh_diagnose.inference_views import MAX_WAITING, PendingImages
 
+from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.policy import MAX_CAMERAS
-from vla_zenoh.types import InferenceDebug
+from vla_zenoh.nodes.worker.node import InferenceDebugPublisher
+from vla_zenoh.policy import (
+    MAX_CAMERAS,
+    ActionSpec,
+    ActionSteps,
+    CameraSpec,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+)
+from vla_zenoh.policy.inference import make_chunk
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import Header, InferenceDebug, Task
 from vla_zenoh.types.records import plain_values
+
+PICTURE = np.zeros((24, 32, 3), np.uint8)
+LOOK = ModelSpec(
+    name="look",
+    observation=ObservationSpec(cameras=(CameraSpec(camera="front"),)),
+    action=ActionSpec(horizon=1, dt_s=0.1, rotation="rpy", gripper="none"),
+)
 
 
 class Tensor:
@@ -57,6 +78,7 @@ def seen(**fields: Any) -> InferenceDebug:
         (np.zeros(5000), "float64 of shape (5000,)"),
         ({"normalised": np.float32(0.25)}, {"normalised": 0.25}),
         (Tensor(), "tensor(cuda)"),
+        (10**30, str(10**30)),
     ],
 )
 def test_whatever_a_model_tells_is_text_numbers_and_lists(given: Any, said: Any) -> None:
@@ -64,6 +86,41 @@ def test_whatever_a_model_tells_is_text_numbers_and_lists(given: Any, said: Any)
     assert said is None or raw["it"] == said
     again = records.decode(InferenceDebug, records.encode(seen(raw=raw)))
     assert again.raw == raw
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"raw": [1, 2]},
+        {"raw": "a thought"},
+        {"raw": np.zeros(3)},
+        {"pictures": {"front": Tensor()}},
+        {"pictures": {"front": [[1], [2, 3]]}},
+        {"pictures": [np.zeros((4, 4, 3), np.uint8)]},
+    ],
+)
+def test_what_a_model_shows_of_itself_is_shown_or_rejected_and_the_worker_lives(
+    told: dict[str, Any],
+) -> None:
+    profile = load_profile("panda_sim")
+    observation = Observation(1, 1, Task(1, True, "", "look", 5.0), images={"front": PICTURE})
+    steps = np.zeros((1, 6), np.float32)
+    chunk = make_chunk("look", LOOK, observation, steps, False, patience_s=1.0, times_ns=(1, 1, 1))
+    with routed_session() as session:
+        node = Node("worker-look", profile, session)
+        shown = InferenceDebugPublisher(node, "look", LOOK)
+        heard = session.declare_subscriber(
+            profile.keys.all_seen_records, zenoh.handlers.RingChannel(9)
+        )
+        pictures = session.declare_subscriber(profile.keys.all_seen, zenoh.handlers.RingChannel(9))
+        await_match(session, profile.keys.seen_record("look"))
+        await_match(session, profile.keys.seen("look", "front"))
+        shown.publish(observation, ActionSteps(steps, **told), Header(1, 1, "look#1"), chunk)
+        assert node.counters["refused.seen"] == ("pictures" in told)
+        if "raw" in told:
+            until("the record", heard.try_recv)
+        pictures.undeclare()
+        node.close()
 
 
 def test_it_travels_and_comes_back() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -10,12 +11,13 @@ import numpy as np
 import pytest
 from driver_report import Report
 
+from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import exp3
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robot import Reading
 from vla_zenoh.robots.python_driver import FAULT_NS, PythonDriver
-from vla_zenoh.types import Event, GripperCommand, JointCommand, JointReference
+from vla_zenoh.types import Event, GripperCommand, JointCommand, JointReference, NodeStatus
 from vla_zenoh.types.records import PoseReference
 
 ARM = """
@@ -229,6 +231,17 @@ def test_optional_methods_are_called(rig: Rig) -> None:
     assert rig.calls == ["connect", (0.02, 0.1, 5.0), "recover", "close"]
     assert driver.status().detail["temperature_c"] == 40
     assert driver.status().detail["width_m"] == 0.02  # none was measured: that of the command
+
+
+@pytest.mark.parametrize(
+    "told", [math.nan, math.inf, b"1.2", 10**30, {1: 2}, [[[[1]]]], "x" * 10**6]
+)
+def test_whatever_it_tells_of_itself_is_published(told: Any, rig: Rig) -> None:
+    for found in ({"told": told}, [told]):
+        rig.driver.robot.status = lambda found=found: found
+        detail = rig.driver.status().detail
+        assert {"told", "value"} & set(detail)
+        records.encode(NodeStatus("arm", "running", "here", 1, 2, detail=detail))
 
 
 def test_they_may_be_missing(plain: Rig) -> None:

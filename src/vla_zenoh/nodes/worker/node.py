@@ -20,7 +20,7 @@ import zenoh
 from vla_zenoh.bus.buffers import Wake
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg
-from vla_zenoh.errors import CodecError, RecordError, SpecError, WorkerError
+from vla_zenoh.errors import SpecError, WorkerError, in_words
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of, takes_robot
@@ -286,8 +286,8 @@ class InferenceDebugPublisher:
                     *(plain_values(answer.raw), chunk.done),
                 )
                 self._record.publish(seen, stamp_wall_ns=stamp_ns, seq=seq)
-        except (RecordError, CodecError) as error:
-            self._node.reject("seen", f"the inference cannot be published: {error}")
+        except Exception as error:  # tensors of a model raise anything
+            self._node.reject("seen", f"the inference cannot be published: {in_words(error)}")
 
 
 def _seen_image(
