@@ -139,7 +139,7 @@ def check(rig: Rig) -> None:
         rig.assert_smooth()
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(events)
 def test_rotation_vectors_and_base_deltas_of_any_kind_stay_within_every_limit(
     script: list[Any],

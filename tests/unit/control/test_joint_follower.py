@@ -200,7 +200,7 @@ def test_every_joint_keeps_its_jerk_and_the_tcp_its_box_whatever_is_asked_for(
 def test_a_pose_that_leaves_the_box_is_not_followed_out_of_it(way_m: list[float]) -> None:
     arm = Arm(profile())
     furthest_m = -1.0
-    for _ in range(40):
+    for _ in range(28):
         arm.step(np.array(way_m), np.zeros(3))
         furthest_m = max(furthest_m, beyond_box_m(KINEMATICS.forward(arm.joints_rad).position_m))
     assert beyond_box_m(arm.smoother.motion.pose.position_m) > 0.01
@@ -275,7 +275,7 @@ def test_commanded_joints_stop_before_the_arm_touches_itself_or_the_table(
     arm.stage = PoseToJoint(of, KINEMATICS, barriers)
     arm.stage.restart(HOME_RAD)
     nearest_m = 1.0
-    for _ in range(40):
+    for _ in range(30):
         arm.step(np.array(way_m), np.array(turn_rad))
         left_m = barriers.collisions.distances(arm.joints_rad) - barriers.stop[1:]
         nearest_m = min(nearest_m, float(left_m.min()))
