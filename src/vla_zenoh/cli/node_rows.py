@@ -39,19 +39,19 @@ class NodeRow(NamedTuple):
 def node_rows(
     said: Statuses, expected: Mapping[str, str], alive: frozenset[str] = frozenset()
 ) -> list[NodeRow]:
-    """Every node that published a status, and those expected on hosts that run, by name.
+    """Every node that is alive or published a status, and those expected on running hosts, by name.
 
     `expected` has the host of each node of the profile; `alive` nodes have a liveliness token.
     """
     if "sim" in said and mode_of(said) == "sim":
         expected = {name: host for name, host in expected.items() if name not in REAL_ROBOTS}
     down = hosts_down(said, expected, alive)
-    names = {*said, *(name for name, host in expected.items() if host not in down)}
+    names = {*said, *alive, *(name for name, host in expected.items() if host not in down)}
     rows: list[NodeRow] = []
     for name in sorted(names):
         host = expected.get(name, "")
         if name not in said:
-            state, why = STARTING, "it has not published its status yet"
+            state, why = STARTING, "no status came from it yet; it starts, or is busy"
             if name not in alive:
                 see = f"see the output of `vla-zenoh up` on host {host}"
                 state, why = MISSING, f"not running; {see}, which should start it"

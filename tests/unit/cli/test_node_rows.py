@@ -75,9 +75,10 @@ def test_nodes_of_a_host_that_is_down_are_told_as_that_host() -> None:
     assert "worker-brick" not in {row.name for row in node_rows(said, EXPECTED)}
 
 
-def test_a_node_with_a_token_and_no_status_yet_is_starting() -> None:
-    rows = {r.name: r for r in node_rows(alive(status("command")), EXPECTED, frozenset({"sim"}))}
-    assert rows["sim"].state == "starting"
+@pytest.mark.parametrize("name", ["sim", "worker-of-my-own"])
+def test_a_node_with_a_token_and_no_status_yet_is_starting_or_busy(name: str) -> None:
+    rows = {r.name: r for r in node_rows(alive(status("command")), EXPECTED, frozenset({name}))}
+    assert (rows[name].state, rows[name].alive) == ("starting", True)
 
 
 def test_a_node_that_crashed_says_why_and_one_that_ended_is_dead() -> None:
