@@ -174,7 +174,11 @@ def state_of(client: Client) -> str:
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+    [
+        signal.SIGINT,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
+    ],
     ids=lambda n: n.name,
 )
 def test_a_signal_brakes_the_arm_first_and_then_ends_everything(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -46,7 +45,6 @@ def nights(
     check_folder(output, begun=(output / PLAN).exists())
     robot = target.load().robot.name
     stop = stop_on_signals()
-    signal.signal(signal.SIGHUP, lambda *_: stop.set())
     with TrialFolder(output).lock():
         trial = UnattendedTrial(output, plan, robot)
         try:

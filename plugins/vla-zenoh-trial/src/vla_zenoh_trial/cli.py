@@ -149,8 +149,7 @@ def _run(
     from vla_zenoh_trial.runner import TrialRunner
 
     stop = stop_on_signals()
-    # Neither a terminal that is closed nor Ctrl-Z may leave a moving arm behind.
-    signal.signal(signal.SIGHUP, lambda *_: stop.set())
+    # Ctrl-Z may leave no moving arm behind.
     signal.signal(signal.SIGTSTP, signal.SIG_IGN)
     done = score(plan, found).done
     blind = "; blind" if plan.blind else ""
