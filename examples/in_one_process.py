@@ -35,7 +35,8 @@ def run(seconds, policy):
         joints = robot.joint_state()
         return Measured(Pose(*robot.tcp()), joints.position_rad, joints.velocity_rad_s)
 
-    guard = ArmGuard(profile, measured, robot.joint_range_rad, velocity_rad_s, TICK_MS / 1e3)
+    joints = robot.joint_range_rad, velocity_rad_s, robot.slides
+    guard = ArmGuard(profile, measured, *joints, TICK_MS / 1e3)
     alive = frozenset({"sim", "camera", f"worker-{name}"})
     seen_by = {"camera_ages_s": {"front": 0.0}, "camera_nodes": {"front": "camera"}}
     peers = PeerSnapshot(alive, "sim", {name: spec}, {name: name}, same_host=alive, **seen_by)

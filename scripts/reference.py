@@ -349,6 +349,7 @@ REASONS = {
     "simulation_fault": "the simulation became unstable",
     "spec_mismatch": "chunk: another spec than the one agreed at activation",
     "stale": "older than the limit of its kind",
+    "step_m": "chunk: a delta of the TCP, or of a joint that slides, that is far too large",
     "step_rad": "chunk: a joint further than any turns, or a delta that is far too large",
     "superseded": "chunk: a newer one is in force",
     "too_many": "ROS: more frames than are kept",

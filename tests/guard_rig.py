@@ -217,7 +217,9 @@ def drive(
     else:
         ends = HOME_RAD - 3, HOME_RAD + 3
         brake = joint_motion_limits(profile, BRAKE_MARGIN)
-        guard = JointGuard(NAMES, HOME_RAD, tick_s, timeout_s, brake, ends)
+        guard = JointGuard(
+            NAMES, HOME_RAD, tick_s, timeout_s, brake, ends, np.zeros(len(NAMES), bool)
+        )
     motions = [guard.motion]
     arrivals: list[tuple[int, Stamped[Any]]] = []
     writer: Any = None

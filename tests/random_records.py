@@ -75,6 +75,7 @@ def joint_states(draw: st.DrawFn) -> JointState:
         draw(vectors(size)),
         draw(st.none() | vectors(size)),
         tuple(draw(st.lists(st.sampled_from(names), unique=True))),
+        tuple(draw(st.lists(st.sampled_from(names), unique=True))),
     )
 
 

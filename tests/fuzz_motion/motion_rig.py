@@ -155,6 +155,7 @@ class Rig:
             self._measure,
             (known.lower_rad, known.upper_rad),
             known.velocity_rad_s,
+            known.slides,
             1.0 / case.guard_hz,
         )
         self._actions = Actions(case)

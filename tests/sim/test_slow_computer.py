@@ -52,7 +52,9 @@ def largest_lag_m(world: World, slowness: float, pauses_ns: dict[int, int]) -> f
         state = world.joint_state()
         return Measured(Pose(*world.tcp()), state.position_rad, state.velocity_rad_s)
 
-    guard = ArmGuard(profile, measure, world.joint_range_rad, np.full(7, np.inf), 2 * STEP_S)
+    guard = ArmGuard(
+        profile, measure, world.joint_range_rad, np.full(7, np.inf), world.slides, 2 * STEP_S
+    )
     rise, pace = Rise(Pose(*world.tcp())), Pace(0)
     now_ns, sent_ns, worst_m, seq = 0, 0, 0.0, 0
     while now_ns < 1.5e9:

@@ -40,8 +40,8 @@ SILENT_S = 5.0
 WHY_PATIENCE_S = 1.0
 """The command node publishes its status twice a second, and at every transition."""
 RESET_AGAIN_S = 0.3
-STANDS_RAD_S, STANDS_S, STATE_AGE_S = 0.02, 0.1, 0.5
-"""An arm stands whose joints are slower than this for so long, by states that are not older."""
+STANDS_S, STATE_AGE_S = 0.1, 0.5
+"""An arm stands whose joints stand (`STANDING`) for so long, by states that are not older."""
 MAX_EVENTS, MAX_REFUSALS = 4096, 256
 MAX_EVENT_BYTES = 64 * 1024
 MAX_WHAT, MAX_WHY = 128, 1000
@@ -208,27 +208,26 @@ class Standstill:
     def take(self, sample: zenoh.Sample) -> None:
         """Take a joint state; runs on Zenoh's thread."""
         self._newest = ReceivedSample(sample, time.monotonic_ns())
-        speed_rad_s = self.speed_rad_s(0.0)
-        if speed_rad_s is not None and speed_rad_s > STANDS_RAD_S:
+        if self._moves(0.0):
             self._moved_s = time.monotonic()
 
-    def speed_rad_s(self, since_s: float) -> float | None:
-        """Of the fastest joint; None: no valid state came since then, or for `STATE_AGE_S`."""
+    def _moves(self, since_s: float) -> bool | None:
+        """Whether a joint moves; None: no valid state came since then, or for `STATE_AGE_S`."""
         newest, now_s = self._newest, time.monotonic()
         if newest is None or newest.mono_ns < max(since_s, now_s - STATE_AGE_S) * 1e9:
             return None
-        from vla_zenoh.types import JointState  # brings numpy, when the stop is out
+        from vla_zenoh.types import STANDING, JointState  # brings numpy, when the stop is out
 
         try:
             state = records.decode(JointState, bytes_of(newest.sample.payload, records.SMALL_BYTES))
         except CodecError:
             return None
-        return float(abs(state.velocity_rad_s).max())
+        return bool((abs(state.velocity_rad_s) > STANDING.of(state.slides)).any())
 
     def stands(self, since_s: float) -> bool:
         """No joint has moved for `STANDS_S`, and states still come."""
         quiet_s = time.monotonic() - max(self._moved_s, since_s)
-        return quiet_s >= STANDS_S and self.speed_rad_s(since_s) is not None
+        return quiet_s >= STANDS_S and self._moves(since_s) is not None
 
 
 class StopClient(NodeRegistry):

@@ -326,7 +326,9 @@ class ChunkPlanner:
             base = measured
         base = space.origin(base)
         steps = space.ordered(action, np.asarray(record.steps[:count, columns], np.float64))
-        rejection = validate_steps(action, steps, base, self._limits, self._max_width_m)
+        rejection = validate_steps(
+            action, steps, base, self._limits, self._max_width_m, space.slides(action)
+        )
         rejection = rejection or space.far_target(action, steps, base)
         if rejection is not None:
             raise self._rejected(rejection)

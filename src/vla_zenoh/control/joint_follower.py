@@ -39,15 +39,15 @@ from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Limits
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, JointBound
 
-POSTURE_1_S, POSTURE_RAD_S = 1.0, 0.2
+POSTURE_1_S, POSTURE = 1.0, JointBound(0.2, 0.06)
 """Rate kp at which a redundant arm goes to its posture, and its greatest speed then."""
 DAMPED_BELOW, DAMPING = 0.03, 4e-4
 """Singular value s0 below which the inverse is damped, and wmax, at a singularity."""
 SINGULARITY_1_S = 5.0
 """ka, rate of the approach to a singularity."""
-NEAR_END_RAD = 0.1
+NEAR_END = JointBound(0.1, 0.03)
 """A joint further from the end of its range is not reported as held by it."""
 ACCELERATION_HALVINGS = 8
 """Of the search for an acceleration: to 1/256 of the range allowed."""
@@ -175,6 +175,10 @@ class JointFollower:
         self.lower_rad = kinematics.lower_rad + margin_rad
         self.upper_rad = kinematics.upper_rad - margin_rad
         self._singularity_stop = singularity_stop
+        self._near_end, self._posture = (
+            NEAR_END.of(kinematics.slides),
+            POSTURE.of(kinematics.slides),
+        )
 
     def step(
         self, now: JointMotion, target: Pose, twist: FloatArray, dt_s: float
@@ -209,7 +213,7 @@ class JointFollower:
             onto[joint] = min(max(reached[joint], low[joint]), high[joint])
             bound = self.upper_rad if reached[joint] > high[joint] else self.lower_rad
             place, name = float(joints[joint]), self.kinematics.arm_joints[joint]
-            if abs(float(bound[joint]) - place) < NEAR_END_RAD:
+            if abs(float(bound[joint]) - place) < self._near_end[joint]:
                 hits.append(LimitHit("joint_limit", place, float(bound[joint]), where=name))
         if ratio > 1.0 + 1e-9:
             joint = int(np.argmax(np.abs(wanted) / self.velocity_rad_s))
@@ -334,9 +338,7 @@ class JointFollower:
         dt_s: float,
     ) -> FloatArray:
         posture = POSTURE_1_S * (self.kinematics.nearest(self.posture_rad, joints) - joints)
-        fastest = float(np.abs(posture).max())
-        if fastest > POSTURE_RAD_S:
-            posture *= POSTURE_RAD_S / fastest
+        posture /= max(float((np.abs(posture) / self._posture).max()), 1.0)
         free = jacobian
         if held.any():
             posture = np.where(held, 0.0, posture)

@@ -43,7 +43,7 @@ from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, norm3
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import REJECT_FACTOR, Profile
-from vla_zenoh.types import Cause, FloatArray, JointCommand
+from vla_zenoh.types import Cause, FloatArray, JointBound, JointCommand
 
 STEP_HALVINGS = 7
 """Of the search for the feasible part of a step: to 1/128 of it."""
@@ -66,7 +66,7 @@ NEARER_M = 5e-4
 CHECK_S = 0.016
 """Between two checks of distances at most, which cost too much for every tick; they look as far
 ahead, and the joints get faster until then."""
-PROBE_RAD = 0.01
+PROBE = JointBound(0.01, 0.003)
 """First bit of the way of an arm that stands: the joint that moves furthest."""
 TCP_ROOM = np.array([[0.95], [0.8], [0.8]])
 """Parts of the TCP's velocity, acceleration and jerk that a straight motion is planned with."""
@@ -83,6 +83,12 @@ def check_ticks(profile: Profile) -> int:
     return max(round(CHECK_S * profile.timing.command_hz), 1)
 
 
+def first_bit(way_rad: FloatArray, kinematics: Kinematics) -> FloatArray:
+    """`way_rad` (n,), or as much of it as no joint goes further than `PROBE`."""
+    longest = float((np.abs(way_rad) / PROBE.of(kinematics.slides)).max())
+    return way_rad / max(longest, 1.0)
+
+
 class JointBounds:
     """Bounds of steps and motions of the joints. Independent of time."""
 
@@ -95,8 +101,9 @@ class JointBounds:
         margin_rad = joint_margins(self.limits.reach, kinematics)
         self.lower_rad = kinematics.lower_rad + margin_rad
         self.upper_rad = kinematics.upper_rad - margin_rad
-        self.leashes = np.where(kinematics.slides, self.limits.lead_m, self.limits.lead_rad)
+        self.leashes = JointBound(self.limits.lead_rad, self.limits.lead_m).of(kinematics.slides)
         """(n,) how far each joint's goal may be ahead."""
+        self._steps = JointBound(self.limits.step_rad, self.limits.step_m).of(kinematics.slides)
 
     def ways(self, start_rad: FloatArray, way_rad: FloatArray) -> tuple[float, float]:
         """Lengths of a straight motion: of the TCP or a sliding joint, m, of others, rad."""
@@ -136,8 +143,7 @@ class JointBounds:
             [step_joints(action, step, base_rad, base_rad, endless) for step in steps]
         )
         away_rad = np.maximum(self.lower_rad - asked_rad, asked_rad - self.upper_rad)
-        slides = self.kinematics.slides
-        mosts = REJECT_FACTOR * np.where(slides, self.limits.step_m, self.limits.step_rad)
+        mosts = REJECT_FACTOR * self._steps
         step, joint = np.unravel_index(int(np.argmax(away_rad / mosts)), away_rad.shape)
         most_rad = float(mosts[joint])
         if away_rad[step, joint] <= most_rad:
@@ -327,7 +333,7 @@ class JointPath(AxisSmoother):
     def near(self, goal: Goal) -> Goal:
         """`goal`, or one so near that the arm can retreat from there."""
         way_rad = self.way_to(goal)
-        leads = np.where(self.kinematics.slides, PAUSE_LEAD_M, PAUSE_LEAD_RAD)
+        leads = JointBound(PAUSE_LEAD_RAD, PAUSE_LEAD_M).of(self.kinematics.slides)
         longest = (np.abs(way_rad) / leads).max()
         if longest <= 1.0:
             return goal
@@ -431,8 +437,7 @@ class JointPath(AxisSmoother):
         here_rad, self._unchecked = self.state.position, 0
         if self.at_rest:
             way_rad = self.way_to(self._asked[0])
-            longest_rad = float(np.abs(way_rad).max())
-            ahead_rad = way_rad * (PROBE_RAD / max(longest_rad, PROBE_RAD))
+            ahead_rad = first_bit(way_rad, self.kinematics)
         elif self.braking:  # an upper bound, so that a new goal does not end the brake
             ahead_rad = stop_way(*self.state[1:], self.box, self._check_ticks * self._dt_s)
         else:  # of the motion in progress, which may still get faster

@@ -15,7 +15,7 @@ import numpy as np
 
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal, pose_distance
 from vla_zenoh.profile import Limits, Profile, ReachLimits
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, JointBound
 
 if TYPE_CHECKING:
     from vla_zenoh.kinematics.kinematics import Kinematics
@@ -31,7 +31,8 @@ PAUSE_LEAD_M, PAUSE_LEAD_RAD = 0.01, 0.02
 """The goal of an arm that another part holds up leads it by this much at most."""
 SPEED_STEPS = 20
 """Number of speed shares of what is measured: each change of the share plans the motion again."""
-BEGIN_M, BEGIN_RAD, BEGIN_JOINT_RAD = 0.002, 0.01, 0.004
+BEGIN_M, BEGIN_RAD = 0.002, 0.01
+BEGIN_JOINT = JointBound(0.004, BEGIN_M)
 """A command stream begins this near to where the robot holds the arm, or its guard rejects it: what
 it begins with is one step of the controller's set-point."""
 LEAST_TO_GOAL = 0.02
@@ -130,7 +131,7 @@ def between(start: FloatArray, end: FloatArray) -> list[FloatArray]:
 
 def joint_margins(limits: ReachLimits, kinematics: Kinematics) -> FloatArray:
     """(n,) kept from both ends of every joint's range, rad, of a joint that slides m."""
-    return np.where(kinematics.slides, limits.joint_margin_m, limits.joint_margin_rad)
+    return JointBound(limits.joint_margin_rad, limits.joint_margin_m).of(kinematics.slides)
 
 
 WAYS_OUT = {

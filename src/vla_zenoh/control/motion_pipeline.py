@@ -11,7 +11,7 @@ from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
 from vla_zenoh.control.commander_io import limit_events, make_event
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
-from vla_zenoh.control.limits import BEGIN_JOINT_RAD, LimitHit, Shares, into_workspace
+from vla_zenoh.control.limits import BEGIN_JOINT, LimitHit, Shares, into_workspace
 from vla_zenoh.control.plan_timeline import (
     Goal,
     GoalTimeline,
@@ -189,8 +189,9 @@ class MotionPipeline:
             self._poses.reset(start)
         if self._joints is not None and self._reach is not None and joint is not None:
             held_rad = held_joints(self._reach.kinematics, joint)
-            apart_rad = float(np.abs(held_rad - self._joints.position_rad).max())
-            if standing and not (self.streaming and apart_rad <= BEGIN_JOINT_RAD):
+            apart_rad = np.abs(held_rad - self._joints.position_rad)
+            near = (apart_rad <= BEGIN_JOINT.of(self._reach.kinematics.slides)).all()
+            if standing and not (self.streaming and near):
                 self._joints.restart(held_rad)
             self._joints.keep_elbow()
         if joints_asked and standing:

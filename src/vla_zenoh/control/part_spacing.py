@@ -22,12 +22,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from vla_zenoh.control.commanded_part import CommandedPart
-from vla_zenoh.control.joint_space import PROBE_RAD, check_ticks
+from vla_zenoh.control.joint_space import check_ticks, first_bit
 from vla_zenoh.control.limits import LimitHit, Slowdown, between, in_steps
 from vla_zenoh.control.watchdog import BAND, PAST, PERIOD_NS
 from vla_zenoh.kinematics.collision import Nearest, PlacedArm
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, JointBound
 
 NAME = "part_distance"
 """Of the limit."""
@@ -40,7 +40,7 @@ SPARE_M = 5e-3
 than their pose would. 3.4 mm were found in 2.5 million ticks of ``fuzz_parts.py``."""
 LEAST_NEAR_PART = 0.05
 """Least share of the speed near the stop: the arms are held there, and have to come away again."""
-STANDS_RAD = 2e-3
+STANDS = JointBound(2e-3, 6e-4)
 """Arms whose joints go on by less than this stand."""
 
 
@@ -71,11 +71,13 @@ class PartSpacing:
     def place(self) -> None:
         """Take the shapes of all parts, with what their grippers hold."""
         placed: list[PlacedArm] = []
+        stands: list[FloatArray] = []
         for part in self._parts:
             base, reach = self._profile.parts[part.name].base, part.reach
             assert reach is not None
             placed.append(PlacedArm(reach.kinematics, reach.barriers.collisions, base))
-        self._placed = placed
+            stands.append(STANDS.of(reach.kinematics.slides))
+        self._placed, self._stands = placed, stands
 
     def look(
         self, now_ns: int, ahead_s: float, *, moves: bool
@@ -107,8 +109,8 @@ class PartSpacing:
         ahead = self._nearest(at, floor_m + NOISE_M, stops)
         # A brake that is given up and begun again would end further on.
         stand = all(
-            np.abs(end - here_rad).max() < STANDS_RAD
-            for here_rad, stop in zip(at, stops, strict=True)
+            (np.abs(end - here_rad) < stands).all()
+            for here_rad, stop, stands in zip(at, stops, self._stands, strict=True)
             for end in stop
         )
         self._held = ahead.distance_m < floor_m or (
@@ -152,8 +154,8 @@ class PartSpacing:
         for part, here_rad in zip(self._parts, at, strict=True):
             wanted_rad = part.motion.wanted_rad(now_ns)
             way_rad = np.zeros(len(here_rad)) if wanted_rad is None else wanted_rad - here_rad
-            longest = float(np.abs(way_rad).max())
-            probe_rad = here_rad + way_rad * min(1.0, PROBE_RAD / max(longest, 1e-9))
+            assert part.reach is not None
+            probe_rad = here_rad + first_bit(way_rad, part.reach.kinematics)
             probes.append(between(here_rad, probe_rad))
         return self._nearest(at, floor_m + NOISE_M, probes).distance_m >= floor_m
 

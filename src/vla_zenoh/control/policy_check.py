@@ -9,11 +9,12 @@ obeys rejects a chunk for one reason at a time, which has a short name and a sen
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.control.actions import (
     FURTHEST_RAD,
@@ -30,7 +31,14 @@ from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.kinematics.so3 import log3
 from vla_zenoh.policy import ActionSpec, ModelSpec, check_steps
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
-from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, ActionChunk, FloatArray, Stamped, Task
+from vla_zenoh.types import (
+    QUATERNION_NORM_TOLERANCE,
+    ActionChunk,
+    FloatArray,
+    JointBound,
+    Stamped,
+    Task,
+)
 
 FUTURE_TOLERANCE_NS = 50_000_000
 """Clocks of two hosts may differ by this; more says that a clock was set."""
@@ -183,17 +191,24 @@ def few_joints(profile: Profile) -> str:
 
 # -- a chunk --------------------------------------------------------------------------------------
 def chunk_errors(
-    spec: ActionSpec, steps: Steps, limits: Limits, max_width_m: float
+    spec: ActionSpec,
+    steps: Steps,
+    limits: Limits,
+    max_width_m: float,
+    sliding: Collection[str] = (),
 ) -> Iterator[Finding]:
-    """Numbers (H, D) of one chunk, from `check_steps`, that cannot have the declared meaning."""
+    """Numbers (H, D) of one chunk, from `check_steps`, that cannot have the declared meaning.
+
+    Of its joints those in `sliding` slide, as far as it is known.
+    """
     steps = steps.astype(np.float64)
     wanted = gripper_range(spec, max_width_m)
     for why in beyond_gripper(spec, steps[:, -1], wanted, max_width_m):
         yield error("gripper_range", why)
     if spec.space == "joint":
-        beyond = beyond_radians(spec, steps, limits)
+        beyond = beyond_joint_units(spec, steps, limits, np.isin(spec.joints, [*sliding]))
         if beyond is not None:
-            yield error("joint_units", beyond[0])
+            yield error("joint_units", beyond.why)
         return
     wrote_6d = spec.rotation == "rotation_6d"
     try:
@@ -254,20 +269,27 @@ def largest_step(spec: ActionSpec, steps: Steps) -> tuple[float, float]:
     return float(np.linalg.norm(position_m, axis=1).max()), float(angles.max())
 
 
-def beyond_radians(
-    spec: ActionSpec, steps: Steps, limits: Limits
-) -> tuple[str, float, float] | None:
-    """Why joints (H, D) are too far for radians, with the largest number and the most allowed."""
+def beyond_joint_units(
+    spec: ActionSpec, steps: Steps, limits: Limits, slides: NDArray[np.bool_]
+) -> Rejection | None:
+    """Why joints (H, D) are too far for radians, or for metres where they slide, true in (n,)."""
     scale = spec.dt_s if spec.kind == "velocity" else 1.0
-    most_rad = FURTHEST_RAD if spec.targets else REJECT_FACTOR * limits.step_rad
+    mosts = REJECT_FACTOR * JointBound(limits.step_rad, limits.step_m).of(slides)
+    if spec.targets:
+        mosts = np.full(len(slides), FURTHEST_RAD)  # or m: the arm's own ranges are checked next
     if spec.kind == "absolute" and spec.turns == "counted":
         return None
-    largest = scale * float(np.abs(steps[:, : spec.arm_size]).max())
-    if largest <= most_rad:
+    largest = scale * np.abs(steps[:, : spec.arm_size]).max(axis=0)
+    worst = int(np.argmax(largest / mosts))
+    far, most = float(largest[worst]), float(mosts[worst])
+    if far <= most:
         return None
     what = "a target" if spec.targets else "a step"
-    why = f"{what} of a joint of {largest:.4g} rad, at most {most_rad:.4g}; are these radians?"
-    return why, largest, most_rad
+    if slides[worst]:
+        why = f"{what} of a joint of {far:.4g} m, at most {most:.4g}; are these metres?"
+        return Rejection("step_m", why, far, most)
+    why = f"{what} of a joint of {far:.4g} rad, at most {most:.4g}; are these radians?"
+    return Rejection("step_rad", why, far, most)
 
 
 def beyond_gripper(
@@ -284,7 +306,8 @@ def beyond_gripper(
 
 
 # -- joints ----------------------------------------------------------------------------------------
-NEAR_RAD, FAR_M = 0.3, 0.1
+FAR_M = 0.1
+NEAR = JointBound(0.3, FAR_M)
 """Numbers this near to the joints, and as a pose this far from the TCP, are joints."""
 LEAST_M, LEAST_RAD = 0.002, 0.01
 """Less than this of a chunk is noise."""
@@ -297,20 +320,24 @@ LOST_SHARE = 0.3
 
 
 def joints_as_pose(
-    spec: ActionSpec, steps: Steps, joints_rad: FloatArray, limits: Limits
+    spec: ActionSpec,
+    steps: Steps,
+    joints_rad: FloatArray,
+    slides: NDArray[np.bool_],
+    limits: Limits,
 ) -> list[Finding]:
     """An error if absolute poses look like joints, of which a step (H, D) has as many numbers.
 
-    The joints (n,) of the arm are those at the observation.
+    The joints (n,) of the arm are those at the observation; of them these slide.
     """
     count = len(joints_rad)
     absolute = spec.space != "joint" and spec.kind == "absolute"
     if not absolute or spec.dimension not in (count, count + 1):
         return []
     outside_m = float(outside_workspace_m(spec, steps, limits).min())
-    away_rad = float(np.abs(steps[0, :count].astype(np.float64) - joints_rad).max())
-    if away_rad <= NEAR_RAD:
-        like = f"its first {count} numbers are within {away_rad:.2f} of the joints in rad"
+    away = np.abs(steps[0, :count].astype(np.float64) - joints_rad)
+    if (away <= NEAR.of(slides)).all():
+        like = f"its first {count} numbers are within {away.max():.2f} of the joints in rad or m"
     elif outside_m > FAR_M:
         like = f"every pose is {outside_m:.2f} m or more outside the workspace"
     else:
@@ -481,18 +508,23 @@ def validate_chunk(
 
 
 def validate_steps(
-    action: ActionSpec, steps: FloatArray, start: Goal, limits: Limits, max_width_m: float
+    action: ActionSpec,
+    steps: FloatArray,
+    start: Goal,
+    limits: Limits,
+    max_width_m: float,
+    slides: NDArray[np.bool_],
 ) -> Rejection | None:
     """Why numbers (n, D) are impossible for steps of this meaning, None if all are possible.
 
-    All steps are checked before the arm follows the first one, which starts from `start`.
+    All steps are checked before the arm follows the first one, which starts from `start`. The
+    joints of their columns that slide are true in `slides`.
     """
     try:
         for step in steps if action.gripper != "none" else ():
             step_width(action, step, start.width_m, max_width_m)
         if action.space == "joint":
-            beyond = beyond_radians(action, steps, limits)
-            return None if beyond is None else Rejection("step_rad", *beyond)
+            return beyond_joint_units(action, steps, limits, slides)
         action, steps = with_quaternions(action, steps)
         rotations = steps[:, action.rotation_columns]
         if action.rotation == "quaternion":

@@ -14,8 +14,8 @@ from copy import copy
 import numpy as np
 
 from vla_zenoh.control.joint_follower import (
+    POSTURE,
     POSTURE_1_S,
-    POSTURE_RAD_S,
     DistanceConstraints,
     JointFollower,
     JointMotion,
@@ -37,15 +37,13 @@ from vla_zenoh.control.states import STOPPING, MotionMode
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Cause, FloatArray, JointCommand
+from vla_zenoh.types import Cause, FloatArray, JointBound, JointCommand
 
-REST_RAD_S = 1e-3
-"""Slower joints stand: an elbow approaches its posture for ever, and is within `REST_RAD_S` /
+REST = JointBound(1e-3, 3e-4)
+"""Slower joints stand: an elbow approaches its posture for ever, and is within `REST` /
 `POSTURE_1_S` of it then. No controller feels a step of this size in its reference's velocity."""
 PULL_1_S = 25.0
 """Rate at which the pull to the posture rises and falls, as a critically damped spring."""
-LONGEST_RAD = POSTURE_RAD_S / POSTURE_1_S
-"""A posture further away pulls no faster."""
 PULL_JERK = 1.4
 """Greatest jerk of that when it reverses, in speeds times `PULL_1_S` squared."""
 LAG_M, LAG_RAD = 0.002, 0.01
@@ -105,8 +103,12 @@ class PoseToJoint:
             margin_rad=joint_margins(limits.reach, kinematics),
             singularity_stop=limits.reach.singularity_stop,
         )
-        most = float(jerk.min()) / PULL_JERK / POSTURE_RAD_S
+        posture = POSTURE.of(kinematics.slides)
+        most = float((jerk / posture).min()) / PULL_JERK
         self._pull_1_s = min(PULL_1_S, most**0.5)
+        self._longest = posture / POSTURE_1_S
+        """(n,) a posture further away pulls no faster."""
+        self._rest = REST.of(kinematics.slides)
         self._dt_s, self._check_ticks = 1.0 / profile.timing.command_hz, check_ticks(profile)
         self._held_by: set[str] = set()
         self.restart(home_rad)
@@ -251,8 +253,8 @@ class PoseToJoint:
         self._pull += self._pull_rate_1_s * dt_s
         here_rad = self._now.position_rad
         way_rad = self._kinematics.nearest(self._posture_rad, here_rad) - here_rad
-        shortened = min(1.0, LONGEST_RAD / max(float(np.abs(way_rad).max()), 1e-9))
-        return here_rad + self._pull * shortened * way_rad
+        longest = float((np.abs(way_rad) / self._longest).max())
+        return here_rad + self._pull / max(longest, 1.0) * way_rad
 
     @property
     def position_rad(self) -> FloatArray:
@@ -270,7 +272,7 @@ class PoseToJoint:
     @property
     def at_rest(self) -> bool:
         """No commanded joint moves."""
-        return float(np.abs(self._now.velocity_rad_s).max()) < REST_RAD_S
+        return bool((np.abs(self._now.velocity_rad_s) < self._rest).all())
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
         """The joint command of this tick."""

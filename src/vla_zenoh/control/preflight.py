@@ -11,14 +11,22 @@ import numpy as np
 
 from vla_zenoh.control import policy_check
 from vla_zenoh.control.joint_space import JointBounds
-from vla_zenoh.control.limits import BEGIN_JOINT_RAD, BEGIN_M, BEGIN_RAD, into_workspace
+from vla_zenoh.control.limits import BEGIN_JOINT, BEGIN_M, BEGIN_RAD, into_workspace
 from vla_zenoh.errors import RecordError, SpecError, VlaZenohError
 from vla_zenoh.keys import LOADING, NO_TASK, NOTHING_YET, OPENING, worker_node
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, FloatArray, GripperState, JointState, PoseState, Stamped
+from vla_zenoh.types import (
+    ActionChunk,
+    FloatArray,
+    GripperState,
+    JointBound,
+    JointState,
+    PoseState,
+    Stamped,
+)
 
 CHUNK_PATIENCE_S = 2.0
 """Every worker publishes chunks all the time; its newest may be this old, plus one period."""
@@ -32,7 +40,7 @@ JOINT_PATIENCE_S = 0.1
 """Beside ``state_timeout_s``: some robots report joints less often than poses."""
 SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
 """Two measurements of one TCP differ by this at most."""
-HELD_RAD = 0.1
+HELD = JointBound(0.1, 0.03)
 """Largest distance of a joint from where its controller holds it."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
 """A robot that moves by less than this, in m and rad, for this long stands."""
@@ -173,7 +181,13 @@ def reasons_by_joints(
         axes = policy_check.beyond_joints(action, steps, jacobian, here.rotation)
     except (RecordError, SpecError):
         return []  # there is a reason for it already
-    found = policy_check.joints_as_pose(action, steps, joints_rad, profile.limits)
+    found = policy_check.joints_as_pose(
+        action, steps, joints_rad, kinematics.slides, profile.limits
+    )
+    slides = np.isin(action.joints, np.array(kinematics.arm_joints)[kinematics.slides])
+    if slides.any():  # else it is known by now
+        beyond = policy_check.beyond_joint_units(action, steps, profile.limits, slides)
+        found += [] if beyond is None else [policy_check.error("joint_units", beyond.why)]
     if action.targets and set(action.joints) == set(kinematics.arm_joints):
         given = bounds.in_chain_order(action, steps.astype(np.float64))
         far = bounds.far_out_of_range(action, given, joints_rad)
@@ -210,14 +224,16 @@ def joint_state_faults(
         return [str(error)]
     apart_m, apart_rad = pose_distance(kinematics.forward(joints_rad), pose_of(pose.record))
     if apart_m <= SAME_TCP_M and apart_rad <= SAME_TCP_RAD:
-        return _elbow_is_not_held(profile, joint.record, pose.record)
+        return _elbow_is_not_held(profile, kinematics, joint.record, pose.record)
     return [
         f"the joints put the TCP {apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad from where "
         "the robot reports it: robot.description or robot.tcp_frame is another robot's"
     ]
 
 
-def _elbow_is_not_held(profile: Profile, joint: JointState, pose: PoseState) -> list[str]:
+def _elbow_is_not_held(
+    profile: Profile, kinematics: Kinematics, joint: JointState, pose: PoseState
+) -> list[str]:
     """Whether joint commands would begin far from the measured joints.
 
     They begin where the robot's controller holds the joints. If the TCP is far from there the arm
@@ -229,13 +245,15 @@ def _elbow_is_not_held(profile: Profile, joint: JointState, pose: PoseState) -> 
     apart_m, apart_rad = pose_distance(held_pose(pose), pose_of(pose))
     if apart_m > profile.limits.tracking_m or apart_rad > profile.limits.tracking_rad:
         return []
-    away_rad = np.abs(joint.reference_rad - joint.position_rad)
-    worst = int(np.argmax(away_rad))
-    if float(away_rad[worst]) <= HELD_RAD:
+    away_rad = np.abs(held_joints(kinematics, joint) - kinematics.joints_of(joint))
+    most = HELD.of(kinematics.slides)
+    worst = int(np.argmax(away_rad / most))
+    if away_rad[worst] <= most[worst]:
         return []
     return [
-        f"joint {joint.names[worst]} is {away_rad[worst]:.2f} rad from where its controller holds "
-        f"it, at most {HELD_RAD:g}: release the arm, or move the robot once by its own means"
+        f"joint {kinematics.arm_joints[worst]} is {away_rad[worst]:.2f} {kinematics.unit(worst)} "
+        f"from where its controller holds it, at most {most[worst]:g}: release the arm, or move "
+        "the robot once by its own means"
     ]
 
 
@@ -454,10 +472,9 @@ def held_joints(kinematics: Kinematics, joint: JointState) -> FloatArray:
     return kinematics.joints_of(joint)
 
 
-def follows(apart_m: float, apart_rad: float, joint_rad: float = 0.0) -> bool:
+def follows(apart_m: float, apart_rad: float) -> bool:
     """The robot holds the streamed pose: to restart there would be a step in the stream."""
-    near = apart_m <= BEGIN_M and apart_rad <= BEGIN_RAD
-    return near and joint_rad <= BEGIN_JOINT_RAD
+    return apart_m <= BEGIN_M and apart_rad <= BEGIN_RAD
 
 
 class Settling:
@@ -481,7 +498,10 @@ class Settling:
         held, held_rad = held_pose(measured), None
         if self._kinematics is not None and joint is not None:
             held_rad = held_joints(self._kinematics, joint)
-        if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
+        if self._standing is not None:
+            before, before_rad, _ = self._standing
+            moved = *pose_distance(held, before), *_ways(held_rad, before_rad)
+        if self._standing is None or max(moved) > SETTLED:
             self._standing = held, held_rad, received_ns
         self._measured_ns = received_ns
 
@@ -493,21 +513,23 @@ class Settling:
         if self._standing is None:
             return []
         held, held_rad, since_ns = self._standing
-        apart = _apart(held, held_rad, commanded, commanded_rad)
-        if follows(*apart) or self._measured_ns - since_ns > SETTLED_NS:
+        apart, ways, joints = pose_distance(held, commanded), _ways(held_rad, commanded_rad), ""
+        near = follows(*apart)
+        if self._kinematics is not None and len(ways):
+            most = BEGIN_JOINT.of(self._kinematics.slides)
+            worst = int(np.argmax(ways / most))
+            near = near and bool(ways[worst] <= most[worst])
+            joints = f", its joints {ways[worst]:.3f} {self._kinematics.unit(worst)}"
+        if near or self._measured_ns - since_ns > SETTLED_NS:
             return []
-        joints = "" if held_rad is None else f", its joints {apart[2]:.3f} rad"
         return [
             f"the robot is still {apart[0]:.3f} m and {apart[1]:.3f} rad from its last "
             f"command{joints}; activate again in {LINGER_NS / 1e9:g} s"
         ]
 
 
-def _apart(
-    pose: Pose, joints_rad: FloatArray | None, other: Pose, others_rad: FloatArray | None
-) -> tuple[float, float, float]:
-    """Distance of two poses in m and rad, and of the joints in rad where both are known."""
-    joint_rad = 0.0
-    if joints_rad is not None and others_rad is not None:
-        joint_rad = float(np.abs(joints_rad - others_rad).max())
-    return *pose_distance(pose, other), joint_rad
+def _ways(joints_rad: FloatArray | None, others_rad: FloatArray | None) -> FloatArray:
+    """(n,) how far each joint is from another place; (0,) where one of them is not known."""
+    if joints_rad is None or others_rad is None:
+        return np.zeros(0)
+    return np.abs(joints_rad - others_rad)

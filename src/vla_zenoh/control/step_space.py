@@ -10,6 +10,9 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vla_zenoh.control.actions import covered_step, step_joints
 from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.joint_space import JointBounds
@@ -65,6 +68,10 @@ class PoseSteps:
     def ordered(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
         """Steps of a chunk in the order of this space."""
         return steps
+
+    def slides(self, action: ActionSpec) -> NDArray[np.bool_]:
+        """(n,) which of the joints in the columns of a chunk slide."""
+        return np.zeros(action.arm_size, bool)
 
     def far_target(self, action: ActionSpec, steps: FloatArray, base: Goal) -> Rejection | None:
         """Why targets are too far away to be intended, besides what `validate_steps` finds."""
@@ -142,6 +149,9 @@ class JointSteps:
 
     def ordered(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
         return self._bounds.in_chain_order(action, steps)
+
+    def slides(self, action: ActionSpec) -> NDArray[np.bool_]:
+        return self._bounds.kinematics.slides
 
     def far_target(self, action: ActionSpec, steps: FloatArray, base: Goal) -> Rejection | None:
         if not action.targets:

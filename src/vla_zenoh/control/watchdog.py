@@ -12,7 +12,7 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node
 from vla_zenoh.policy.plan_clock import FOREVER_NS
 from vla_zenoh.profile import Profile, Timing
-from vla_zenoh.types import FloatArray, Task
+from vla_zenoh.types import FloatArray, JointBound, Task
 
 FIRST_CHUNK_PATIENCE_S = 1.0
 """Extra time for the first chunk after activation: it needs an observation and an inference."""
@@ -159,13 +159,13 @@ class JointMonitor(Monitor):
         self._reach = reach
         barriers, slides = reach.barriers, reach.kinematics.slides
         limits = profile.limits
-        self._elbow_limits = np.where(slides, limits.tracking_m, limits.elbow_rad)
+        self._elbow_limits = JointBound(limits.elbow_rad, limits.tracking_m).of(slides)
         margins = joint_margins(limits.reach, reach.kinematics)
         self._stop = np.concatenate([margins, barriers.stop])
         self._slow = np.concatenate([2 * margins, barriers.slow])
         others = np.ones(len(barriers.stop))
         self._past = np.concatenate([PAST_MARGIN * margins, PAST * others])
-        self._band = np.concatenate([np.where(slides, BAND, BAND_RAD), BAND * others])
+        self._band = np.concatenate([JointBound(BAND_RAD, BAND).of(slides), BAND * others])
         self.reset()
 
     def reset(self) -> None:

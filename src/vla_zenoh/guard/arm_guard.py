@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.control.limits import ROTATION_BOX, JointMotionLimits, joint_motion_limits
 from vla_zenoh.control.states import OBEYING
@@ -19,12 +20,17 @@ from vla_zenoh.guard.stream_guard import (
 )
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import GripperProfile, Profile
-from vla_zenoh.types import FloatArray, GripperCommand, JointCommand, PoseCommand, Stamped
+from vla_zenoh.types import (
+    STANDING,
+    FloatArray,
+    GripperCommand,
+    JointBound,
+    JointCommand,
+    PoseCommand,
+    Stamped,
+)
 from vla_zenoh.types.records import JointReference, PoseReference
 from vla_zenoh.types.stream import SingleWriterFilter
-
-STANDING_RAD_S = 0.02
-"""An arm whose joints are all slower than this stands: its control law may be exchanged."""
 
 UNHEEDED = frozenset({"jump", "too_fast", "out_of_range", "names", "moving", "other_mode"})
 """Reasons for which a stream is rejected although no other is followed: its writer must know."""
@@ -35,6 +41,7 @@ ACTIVE_STATES = frozenset(state.value for state in OBEYING)
 ARM_SETTLES_NS = 500_000_000
 """After the last command the arm comes to rest within this time."""
 MOVED_M, MOVED_RAD = 0.005, 0.02
+MOVED_JOINT = JointBound(MOVED_RAD, MOVED_M)
 """An arm at rest that moves further than this, TCP or any joint, is moved by something else; its
 elbow may move while the TCP stays."""
 
@@ -70,6 +77,7 @@ class ArmGuard:
         measure: reads the state of the arm.
         joint_range_rad: lower and upper ends of the joint ranges, (n,) each.
         joint_velocity_rad_s: (n,) that the robot allows, whatever the profile says.
+        slides: (n,) joints that slide.
         dt_s: period of the controller.
     """
 
@@ -79,6 +87,7 @@ class ArmGuard:
         measure: Callable[[], Measured],
         joint_range_rad: tuple[FloatArray, FloatArray],
         joint_velocity_rad_s: FloatArray,
+        slides: NDArray[np.bool_],
         dt_s: float,
     ) -> None:
         robot, timeout_s, here = profile.robot, profile.timing.command_timeout_s, measure()
@@ -88,10 +97,10 @@ class ArmGuard:
         self._guards: dict[CommandKind, PoseGuard | JointGuard] = {
             "pose": PoseGuard(here.pose, dt_s, timeout_s, pose_brake_limits(profile)),
             "joint": JointGuard(
-                robot.arm_joints, here.position_rad, dt_s, timeout_s, brake, joint_range_rad
+                robot.arm_joints, here.position_rad, dt_s, timeout_s, brake, joint_range_rad, slides
             ),
         }
-        self._measure = measure
+        self._measure, self._standing = measure, STANDING.of(slides)
         self._writer = self._state = ""
         self._unheeded_until_ns = self._now_ns = 0
         self.kind: CommandKind = robot.command
@@ -179,7 +188,7 @@ class ArmGuard:
         if self.following or self.braking:
             return "other_mode"
         measured = self._measure()
-        if float(np.abs(measured.velocity_rad_s).max()) > STANDING_RAD_S:
+        if (np.abs(measured.velocity_rad_s) > self._standing).any():
             return "moving"
         self._guards[kind].anchor(measured.at(kind))
         return None
@@ -219,10 +228,11 @@ class HeldReference:
 
     A controller keeps holding it, some distance from the measured arm, and the next stream must
     begin there. It no longer counts once something else moves the arm. Times are of the monotonic
-    clock.
+    clock; of the joints, those slide that are true in `slides` (n,).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, slides: NDArray[np.bool_]) -> None:
+        self._most = MOVED_JOINT.of(slides)
         self._sent_ns: int | None = None
         self._settled: Measured | None = None
 
@@ -244,8 +254,8 @@ class HeldReference:
         if self._settled is None:
             self._settled = measured
         apart_m, apart_rad = pose_distance(self._settled.pose, measured.pose)
-        turned_rad = float(np.abs(measured.position_rad - self._settled.position_rad).max())
-        if apart_m > MOVED_M or max(apart_rad, turned_rad) > MOVED_RAD:
+        ways = np.abs(measured.position_rad - self._settled.position_rad)
+        if apart_m > MOVED_M or apart_rad > MOVED_RAD or (ways > self._most).any():
             self.invalidate()
         return self.held
 

@@ -12,9 +12,10 @@ from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.control.limits import (
-    BEGIN_JOINT_RAD,
+    BEGIN_JOINT,
     BEGIN_M,
     BEGIN_RAD,
     ROTATION_BOX,
@@ -39,6 +40,7 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     FloatArray,
     Header,
+    JointBound,
     JointCommand,
     JointReference,
     PoseCommand,
@@ -56,7 +58,8 @@ has to be undone."""
 STILL = 1e-4
 """m/s and rad/s: a stream that ends slower than this has ended on purpose."""
 
-JUMP_M, JUMP_RAD, JUMP_JOINT_RAD = 0.02, 0.1, 0.05
+JUMP_M, JUMP_RAD = 0.02, 0.1
+JUMP_JOINT = JointBound(0.05, JUMP_M)
 """A command may be this far from the reference in force: TCP, or each joint."""
 BEGIN_M_S, BEGIN_RAD_S = 0.03, 0.1
 """The first command of a stream may move this fast, TCP or each joint: our streams begin at rest.
@@ -402,7 +405,8 @@ class PoseGuard(StreamGuard[Motion]):
 class JointGuard(StreamGuard[JointReference]):
     """Guard of a stream of joint positions, which `names` has in the order of every (n,) here.
 
-    `position_rad` is where the robot stands, `range_rad` the lower and upper ends of its joints.
+    `position_rad` is where the robot stands, `range_rad` the lower and upper ends of its joints, of
+    which those slide that are true in `slides` (n,).
     """
 
     def __init__(
@@ -413,8 +417,11 @@ class JointGuard(StreamGuard[JointReference]):
         timeout_s: float,
         brake: JointMotionLimits,
         range_rad: tuple[FloatArray, FloatArray],
+        slides: NDArray[np.bool_],
     ) -> None:
         self._names, self._limits, self._range_rad = tuple(names), brake, range_rad
+        self._jump, self._begin = JUMP_JOINT.of(slides), BEGIN_JOINT.of(slides)
+        self._begin_speed = JointBound(BEGIN_RAD_S, BEGIN_M_S).of(slides)
         whole = np.ones(len(position_rad))
         limits = GovernorLimits(*brake, axis=whole, beside=whole)
         super().__init__(JointSpace(), position_rad, dt_s, timeout_s, limits)
@@ -434,14 +441,14 @@ class JointGuard(StreamGuard[JointReference]):
             wanted = JointReference(*(column[order] for column in wanted))
         here_rad, limits = self.motion.position_rad, self._limits
         speeds_rad_s = np.abs(wanted.velocity_rad_s)
-        jump_rad = JUMP_JOINT_RAD if self.following else BEGIN_JOINT_RAD
-        if (np.abs(wanted.position_rad - self._expected.position_rad) > jump_rad).any():
+        jump = self._jump if self.following else self._begin
+        if (np.abs(wanted.position_rad - self._expected.position_rad) > jump).any():
             return "jump"
         if (speeds_rad_s > limits.velocity_rad_s).any() or (
             np.abs(wanted.acceleration_rad_s2) > limits.acceleration_rad_s2
         ).any():
             return "too_fast"
-        if not self.following and (speeds_rad_s > BEGIN_RAD_S).any():
+        if not self.following and (speeds_rad_s > self._begin_speed).any():
             return "too_fast"
         # An arm outside its range may come back, but go no further out.
         lower_rad, upper_rad = self._range_rad

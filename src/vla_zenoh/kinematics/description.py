@@ -13,9 +13,13 @@ import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from vla_zenoh.errors import ProfileError, ResourceError, nearest
+from vla_zenoh import resources
+from vla_zenoh.errors import MissingExtraError, ProfileError, ResourceError, nearest
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import RobotProfile
 
 MOVING = ("revolute", "prismatic", "continuous")
 """Types of joints that have one degree of freedom."""
@@ -451,3 +455,13 @@ def is_xacro(root: ElementTree.Element) -> bool:
     if any("${" in text or "$(" in text for text in texts):
         return True
     return not parts and any("xacro" in str(element.tag) for element in root.iter())
+
+
+def sliding_joints(robot: RobotProfile) -> frozenset[str]:
+    """Joints that slide, whose positions are m; none where the robot's description is not here."""
+    try:
+        joints = Description(resources.robot_urdf(robot.description)).joints
+    except (ResourceError, MissingExtraError):
+        return frozenset()
+    arm = [joints[name] for name in robot.arm_joints if name in joints]
+    return frozenset(joint.name for joint in arm if joint.unit == "m")

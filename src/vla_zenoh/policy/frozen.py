@@ -10,9 +10,10 @@ import numpy as np
 
 from vla_zenoh.policy.inference import Observation
 from vla_zenoh.policy.meaning import wrapped
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, JointBound
 
 MOVED_M, MOVED_RAD = 0.02, 0.1
+MOVED_JOINT = JointBound(MOVED_RAD, MOVED_M)
 """An arm that moved by less since an image appeared may look the same in it."""
 
 
@@ -89,5 +90,5 @@ def _moved(then: Observation, now: Observation) -> bool | None:
         ways_rad: FloatArray = now.joint.position_rad - then.joint.position_rad
         if now.joint.endless:
             ways_rad = wrapped(ways_rad)
-        return bool(np.max(np.abs(ways_rad), initial=0.0) > MOVED_RAD)
+        return bool((np.abs(ways_rad) > MOVED_JOINT.of(now.joint.slides)).any())
     return None

@@ -71,9 +71,9 @@ class Arm:
         nowhere = np.zeros(len(profile.robot.arm_joints))
         self._unknown = Measured(Pose(np.zeros(3), np.eye(3)), nowhere, nowhere)
         self._measured = driver.state_now()
-        allowed = driver.joint_range_rad, driver.joint_velocity_rad_s
-        self.guard = ArmGuard(profile, self._state_now, *allowed, driver.period_s)
-        self._hold = HeldReference()
+        joints = driver.joint_range_rad, driver.joint_velocity_rad_s, driver.slides
+        self.guard = ArmGuard(profile, self._state_now, *joints, driver.period_s)
+        self._hold = HeldReference(driver.slides)
         self._timeout_s = profile.timing.command_timeout_s
         self._stalled_until_ns = 0
         self._resting = False

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.errors import NodeError
@@ -173,6 +174,11 @@ class RobotDriver(ABC):
     def joint_velocity_rad_s(self) -> FloatArray:
         """Limits (n,) of the joints' velocity by the description, in the same order."""
         return self.kinematics.velocity_rad_s[self._order]
+
+    @property
+    def slides(self) -> NDArray[np.bool_]:
+        """(n,) joints that slide, in the same order."""
+        return self.kinematics.slides[self._order]
 
     @property
     def _order(self) -> list[int]:

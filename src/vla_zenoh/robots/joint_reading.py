@@ -173,7 +173,9 @@ class JointReading:
         self._home_quat = home_orientation(profile, kinematics)
         at = [kinematics.arm_joints.index(name) for name in robot.arm_joints]
         lower_rad, upper_rad = (ends_rad[at] for ends_rad in kinematics.sampled_rad)
+        self._units = [kinematics.unit(index) for index in at]
         self._endless = tuple(itertools.compress(robot.arm_joints, kinematics.endless[at]))
+        self._sliding = tuple(itertools.compress(robot.arm_joints, kinematics.slides[at]))
         kinds = [kinematics.described.joints[name].kind for name in robot.arm_joints]
         within_turn = upper_rad - lower_rad <= TURN_RAD
         self._turns = (np.array(kinds) == "continuous") & within_turn
@@ -212,17 +214,22 @@ class JointReading:
         self._check_locked(joints, places)
         at = [places[name] for name in self.arm_joints]
         reported_rad = _finite("position", joints.position[at])
-        self._check(reported_rad - self._middle_rad, self._furthest_rad, reported_rad, "rad")
+        self._check(reported_rad - self._middle_rad, self._furthest_rad, reported_rad)
         position = self._counted(reported_rad)
         if joints.velocity is None:
             velocity = self._velocity(position, stamp_ns)
         else:
             velocity = _finite("velocity", joints.velocity[at])
-            self._check(velocity, self._fastest_rad_s, velocity, "rad/s")
+            self._check(velocity, self._fastest_rad_s, velocity, "/s")
         self._arm_newness.check(made_ns)
         try:
             state = JointState(
-                self.arm_joints, position, velocity, self._effort(joints, at), endless=self._endless
+                self.arm_joints,
+                position,
+                velocity,
+                self._effort(joints, at),
+                endless=self._endless,
+                sliding=self._sliding,
             )
         except RecordError as error:
             raise CodecError("invalid", str(error)) from error
@@ -254,11 +261,12 @@ class JointReading:
                     "pose would be wrong. Put it there, or change the profile",
                 )
 
-    def _check(self, off: FloatArray, most: FloatArray, values: FloatArray, unit: str) -> None:
+    def _check(self, off: FloatArray, most: FloatArray, values: FloatArray, per: str = "") -> None:
         """Reject `values` whose `off` exceeds `most`, all (n,)."""
         wrong = np.flatnonzero(np.abs(off) > most)
         if wrong.size:
             joint = int(wrong[0])
+            unit = self._units[joint] + per
             raise CodecError(
                 "invalid",
                 f"{self.arm_joints[joint]} at {values[joint]:.4g} {unit}: nothing that an arm of "

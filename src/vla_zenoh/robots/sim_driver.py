@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zenoh
+from numpy.typing import NDArray
 
 from vla_zenoh.bus.buffers import CallbackRing, bytes_of
 from vla_zenoh.bus.clock import Tick
@@ -353,6 +354,10 @@ class SimPart(RobotDriver):
     @property
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
         return self._arm.joint_range_rad
+
+    @property
+    def slides(self) -> NDArray[np.bool_]:
+        return self._arm.slides
 
     @property
     def joint_velocity_rad_s(self) -> FloatArray:

@@ -107,6 +107,7 @@ class World:
         }
         arm = next(iter(self.parts.values()))
         self.joint_range_rad, self.tcp = arm.joint_range_rad, arm.tcp
+        self.slides = arm.slides
         self.hold_reference, self.set_gripper = arm.hold_reference, arm.set_gripper
         self.joint_state, self.pose_state = arm.joint_state, arm.pose_state
         self.gripper_state, self.wrench = arm.gripper_state, arm.wrench
@@ -300,6 +301,9 @@ class SimulatedPart:
             np.where(endless, np.inf, upper_rad),
         )
         self._endless = tuple(itertools.compress(robot.arm_joints, endless))
+        self.slides = model.jnt_type[dofs] == mujoco.mjtJoint.mjJNT_SLIDE
+        """(n,) joints that slide."""
+        self._sliding = tuple(itertools.compress(robot.arm_joints, self.slides))
 
     def reset(self) -> None:
         """Put the joints at home, at rest, with the gripper open."""
@@ -443,6 +447,7 @@ class SimulatedPart:
             self._effort_nm,
             held_rad,
             self._endless,
+            self._sliding,
         )
 
     def tcp(self) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,8 @@ from vla_zenoh import lazy_names
 if TYPE_CHECKING:
     from vla_zenoh.types.arrays import *
     from vla_zenoh.types.form import *
+    from vla_zenoh.types.joint_bound import *
     from vla_zenoh.types.records import *
     from vla_zenoh.types.stream import *
 
-__getattr__ = lazy_names(__name__, "stream", "form", "records", "arrays")
+__getattr__ = lazy_names(__name__, "stream", "form", "records", "arrays", "joint_bound")

@@ -56,9 +56,7 @@ LATENCY_STAGES = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointState(Record):
-    """Arm joints, without the fingers: all arrays have one entry per name.
-
-    In rad and Nm, of a joint that slides in m and N.
+    """Arm joints, without the fingers: all arrays have one entry per name, in rad and Nm.
 
     Args:
         position_rad, velocity_rad_s: (n,) measured.
@@ -70,6 +68,7 @@ class JointState(Record):
             none or the robot does not report them.
         endless: those of `names` that turn without an end. Their positions are counted over turns,
             from within (-pi, pi] at the start of the robot's node.
+        sliding: those of `names` that slide, whose numbers are in m and N.
     """
 
     names: Names
@@ -78,11 +77,18 @@ class JointState(Record):
     effort_nm: PerJoint | None
     reference_rad: PerJoint | None = None
     endless: Names = ()
+    sliding: Names = ()
 
     def _check(self) -> None:
         check_per_joint(self)
-        if unknown := set(self.endless) - set(self.names):
-            raise RecordError(f"endless has {', '.join(unknown)}, allowed: some of names")
+        for kind in ("endless", "sliding"):
+            if unknown := set(getattr(self, kind)) - set(self.names):
+                raise RecordError(f"{kind} has {', '.join(unknown)}, allowed: some of names")
+
+    @property
+    def slides(self) -> NDArray[np.bool_]:
+        """(n,) which joints slide."""
+        return np.isin(self.names, self.sliding)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

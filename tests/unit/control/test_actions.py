@@ -175,12 +175,17 @@ def test_6d_rotations_are_checked_and_bounded_as_quaternions_are() -> None:
     start = Goal(BEFORE, 0.04)
     for numbers, reason in (([0.0] * 6, "meaning"), ([1, 0, 0, 0, -1, 0], "step_rad")):
         steps = np.array([[0.0, 0, 0, *numbers]])
-        refused = validate_steps(action, steps, start, limits, MAX_WIDTH_M)
+        refused = validate_steps(action, steps, start, limits, MAX_WIDTH_M, np.zeros(0, bool))
         assert refused is not None
         assert refused[0] == reason
     assert (
         validate_steps(
-            action, np.array([[0.0, 0, 0, 1, 0, 0, 0, 1, 0]]), start, limits, MAX_WIDTH_M
+            action,
+            np.array([[0.0, 0, 0, 1, 0, 0, 0, 1, 0]]),
+            start,
+            limits,
+            MAX_WIDTH_M,
+            np.zeros(0, bool),
         )
         is None
     )

@@ -25,7 +25,7 @@ from command_rig import (
 
 from vla_zenoh.control.axis_smoothing import AxisSmoother
 from vla_zenoh.control.commander import MAX_ANSWER_S, Commander, Inputs, Setting
-from vla_zenoh.control.limits import BEGIN_JOINT_RAD
+from vla_zenoh.control.limits import BEGIN_JOINT
 from vla_zenoh.control.motion_pipeline import LINGER_NS
 from vla_zenoh.keys import OPENING
 from vla_zenoh.kinematics.so3 import norm3
@@ -512,7 +512,7 @@ def test_a_robot_whose_joints_swing_past_their_last_command_is_not_activated_the
     out = rig.put("active", True)
     assert rig.state == "active"
     assert out.joint is not None
-    np.testing.assert_allclose(out.joint.position_rad, rig.joints_rad, atol=BEGIN_JOINT_RAD)
+    np.testing.assert_allclose(out.joint.position_rad, rig.joints_rad, atol=BEGIN_JOINT.turns)
 
 
 def test_a_repeated_state_does_not_show_that_the_robot_stands() -> None:

@@ -13,6 +13,7 @@ from vla_zenoh.profile import load_profile
 
 LIMITS = load_profile("panda_sim").limits
 SIX_JOINTS_RAD = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
+TURN = np.zeros(6, bool)
 POSE = [0.45, 0.0, 0.3, 3.1, 0.0, 0.0]
 
 
@@ -26,7 +27,7 @@ def deltas(**parts: object) -> ActionSpec:
 
 def test_joint_positions_declared_as_poses_are_an_error_that_says_why() -> None:
     steps = np.array([SIX_JOINTS_RAD, SIX_JOINTS_RAD + 0.02], np.float32)
-    (finding,) = joints_as_pose(absolute(), steps, SIX_JOINTS_RAD, LIMITS)
+    (finding,) = joints_as_pose(absolute(), steps, SIX_JOINTS_RAD, TURN, LIMITS)
     assert finding.level == "error"
     assert "these are joint positions" in finding.why
     assert "within 0.00 of the joints in rad" in finding.why
@@ -34,18 +35,18 @@ def test_joint_positions_declared_as_poses_are_an_error_that_says_why() -> None:
 
 def test_joint_positions_far_from_the_arm_s_are_found_by_the_workspace() -> None:
     steps = np.full((2, 6), -2.0, np.float32)
-    (finding,) = joints_as_pose(absolute(), steps, SIX_JOINTS_RAD, LIMITS)
+    (finding,) = joints_as_pose(absolute(), steps, SIX_JOINTS_RAD, TURN, LIMITS)
     assert "or more outside the workspace" in finding.why
 
 
 def test_poses_are_no_joint_positions() -> None:
     steps = np.array([POSE, POSE], np.float32)
-    assert joints_as_pose(absolute(), steps, SIX_JOINTS_RAD, LIMITS) == []
+    assert joints_as_pose(absolute(), steps, SIX_JOINTS_RAD, TURN, LIMITS) == []
 
 
 def test_poses_of_an_arm_with_another_number_of_joints_are_not_looked_at() -> None:
     steps = np.array([POSE, POSE], np.float32)
-    assert joints_as_pose(absolute(), steps, np.zeros(7), LIMITS) == []
+    assert joints_as_pose(absolute(), steps, np.zeros(7), np.zeros(7, bool), LIMITS) == []
 
 
 def jacobian_without(*axes: int) -> np.ndarray:

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_zenoh.guard.arm_guard import STANDING_RAD_S, UNHEEDED_NS, ArmGuard, CommandKind, Measured
+from vla_zenoh.guard.arm_guard import UNHEEDED_NS, ArmGuard, CommandKind, Measured
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import load_profile
-from vla_zenoh.types import Header, JointCommand, PoseCommand, Stamped
+from vla_zenoh.types import STANDING, Header, JointCommand, PoseCommand, Stamped
 from vla_zenoh.types.records import JointReference, PoseReference
 
 PROFILE = load_profile("panda_sim")
@@ -20,6 +20,7 @@ START_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
 SILENT_MS = round(PROFILE.timing.command_timeout_s * 1e3) + 5
 UNIT = np.array([0.0, 0.0, 0.0, 1.0])
+TURNS = np.zeros(7, bool)
 
 
 class Side:
@@ -28,7 +29,9 @@ class Side:
     def __init__(self, mode: CommandKind = "pose", most_rad_s: float = np.inf) -> None:
         self.measured = Measured(Pose(np.array([0.43, 0.0, 0.3]), np.eye(3)), HOME_RAD, np.zeros(7))
         ends = HOME_RAD - 1, HOME_RAD + 1
-        self.guard = ArmGuard(PROFILE, lambda: self.measured, ends, np.full(7, most_rad_s), 1e-3)
+        self.guard = ArmGuard(
+            PROFILE, lambda: self.measured, ends, np.full(7, most_rad_s), TURNS, 1e-3
+        )
         self.guard.kind = mode
         self.now_ns, self.seq = START_NS, 0
 
@@ -135,7 +138,7 @@ def test_while_the_arm_brakes_the_other_stream_may_not_begin() -> None:
 def test_an_arm_that_still_swings_is_not_handed_over() -> None:
     side = Side()
     swinging = np.zeros(7)
-    swinging[4] = -1.5 * STANDING_RAD_S
+    swinging[4] = -1.5 * STANDING.turns
     side.measured = side.measured._replace(velocity_rad_s=swinging)
     assert side.joint() == "moving"
     assert side.guard.kind == "pose"

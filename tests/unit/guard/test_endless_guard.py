@@ -15,6 +15,7 @@ NAMES = ("shoulder", "wrist")
 BRAKE = JointMotionLimits(np.full(2, 2.0), np.full(2, 10.0), np.full(2, 200.0))
 ENDS = np.array([-1.0, -math.inf]), np.array([1.0, math.inf])
 HERE = np.array([0.0, 3.0])
+TURNS = np.zeros(2, bool)
 TICK_NS, START_NS = 4_000_000, 10**18
 SPEED_RAD_S, RAMP_S = 1.5, 0.5
 
@@ -23,7 +24,7 @@ class Stream:
     """Commands to a guard of an arm that stands at `HERE`."""
 
     def __init__(self) -> None:
-        self.guard = JointGuard(NAMES, HERE, TICK_NS / 1e9, 0.1, BRAKE, ENDS)
+        self.guard = JointGuard(NAMES, HERE, TICK_NS / 1e9, 0.1, BRAKE, ENDS, TURNS)
         self.seq = 0
 
     @property
@@ -73,7 +74,7 @@ def test_the_same_place_some_turns_away_is_a_jump(turns: int) -> None:
 
 
 def test_the_ends_of_the_other_joint_hold() -> None:
-    guard = JointGuard(NAMES, np.array([1.0, 99.0]), TICK_NS / 1e9, 0.1, BRAKE, ENDS)
+    guard = JointGuard(NAMES, np.array([1.0, 99.0]), TICK_NS / 1e9, 0.1, BRAKE, ENDS, TURNS)
     record = JointCommand(NAMES, np.array([1.001, 99.0]), np.zeros(2), np.zeros(2), "active")
     command = Stamped(Header(START_NS, 1, "command#1"), record, START_NS)
     assert guard.offer(command, START_NS) == "out_of_range"

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from guard_rig import stop_from
 
-from vla_zenoh.control.limits import BEGIN_JOINT_RAD, JointMotionLimits, joint_motion_limits
+from vla_zenoh.control.limits import BEGIN_JOINT, JointMotionLimits, joint_motion_limits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.guard.stream_guard import (
     BEGIN_RAD_S,
-    JUMP_JOINT_RAD,
+    JUMP_JOINT,
     JointGuard,
 )
 from vla_zenoh.profile import load_profile
@@ -22,6 +22,7 @@ from vla_zenoh.types import FloatArray, Header, JointCommand, JointReference, St
 PROFILE = load_profile("panda_sim")
 NAMES = PROFILE.robot.arm_joints
 HOME_RAD = np.array(PROFILE.robot.home_rad)
+TURNS = np.zeros(len(NAMES), bool)
 LOWER_RAD, UPPER_RAD = RANGE_RAD = HOME_RAD - 1.0, HOME_RAD + 1.0
 TIMEOUT_S = PROFILE.timing.command_timeout_s
 BRAKE = joint_motion_limits(PROFILE, BRAKE_MARGIN)
@@ -62,7 +63,7 @@ def stamped(
 
 
 def make_guard() -> JointGuard:
-    return JointGuard(NAMES, HOME_RAD, TICK_S, TIMEOUT_S, BRAKE, RANGE_RAD)
+    return JointGuard(NAMES, HOME_RAD, TICK_S, TIMEOUT_S, BRAKE, RANGE_RAD, TURNS)
 
 
 def begun() -> JointGuard:
@@ -142,7 +143,7 @@ def test_fewer_or_more_joints_than_the_arm_has_are_refused(count: int) -> None:
 
 @pytest.mark.parametrize("joint", range(7))
 def test_a_jump_of_any_joint_is_refused_and_a_small_step_is_not(joint: int) -> None:
-    for limit_rad, followed in ((BEGIN_JOINT_RAD, False), (JUMP_JOINT_RAD, True)):
+    for limit_rad, followed in ((BEGIN_JOINT.turns, False), (JUMP_JOINT.turns, True)):
         step = np.eye(7)[joint] * limit_rad * 1.01
         guard = begun() if followed else make_guard()
         assert refusal(guard, START_NS, still(HOME_RAD + step)) == "jump"
@@ -163,7 +164,7 @@ def test_a_stream_that_goes_on_after_the_robots_own_brake_makes_no_step(
 ) -> None:
     """Lost for a moment, and its writer brakes as well as soon as it hears of it."""
     dt_s = STREAM_S
-    guard = JointGuard(NAMES, HOME_RAD, dt_s, TIMEOUT_S, BRAKE, RANGE_RAD)
+    guard = JointGuard(NAMES, HOME_RAD, dt_s, TIMEOUT_S, BRAKE, RANGE_RAD, TURNS)
     velocity = np.eye(7)[0] * speed_rad_s
     slow = joint_motion_limits(PROFILE)
     stop, last, heard_s = None, guard.motion, np.inf
@@ -320,7 +321,7 @@ def test_a_restart_in_a_brake_ends_it() -> None:
 def test_limits_may_be_given_for_any_arm() -> None:
     brake = JointMotionLimits(np.ones(2), np.ones(2), np.full(2, 10.0))
     ends = np.full(2, -1.0), np.full(2, 1.0)
-    guard = JointGuard(("a", "b"), np.zeros(2), TICK_S, 0.1, brake, ends)
+    guard = JointGuard(("a", "b"), np.zeros(2), TICK_S, 0.1, brake, ends, TURNS[:2])
     command = JointCommand(("b", "a"), [0.001, 0.002], [0, 0], [0, 0], "active")
     for tick in range(500):
         now_ns = START_NS + tick * TICK_NS

@@ -378,7 +378,7 @@ def at(x_m: float, elbow_rad: float = 0.0) -> Measured:
 
 
 def test_what_was_sent_last_counts_until_somebody_moves_the_arm() -> None:
-    hold = HeldReference()
+    hold = HeldReference(np.zeros(2, bool))
     assert not hold.update(at(0), 0)
     hold.on_sent(0)
     assert hold.update(at(0.5), ARM_SETTLES_NS // 2), "it still settles"
@@ -391,7 +391,7 @@ def test_what_was_sent_last_counts_until_somebody_moves_the_arm() -> None:
 
 
 def test_an_elbow_that_somebody_moved_while_the_tcp_stayed_is_not_held_any_more() -> None:
-    hold = HeldReference()
+    hold = HeldReference(np.zeros(2, bool))
     hold.on_sent(0)
     assert hold.update(at(0.1), ARM_SETTLES_NS)
     assert hold.update(at(0.1, 0.9 * MOVED_RAD), 2 * ARM_SETTLES_NS)

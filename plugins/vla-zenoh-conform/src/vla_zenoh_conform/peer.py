@@ -26,6 +26,7 @@ from vla_zenoh.types import (
     ClockReply,
     GripperState,
     Header,
+    JointBound,
     JointCommand,
     JointState,
     PoseCommand,
@@ -39,7 +40,8 @@ Record = TypeVar("Record")
 ASKS, REPLY_S = 3, 1.0
 MAX_SAMPLES = 200_000
 PERIOD_S, BEFORE_S, AFTER_S, REST_S = 0.01, 0.3, 1.0, 0.7
-WAY_RAD, WAY_M = 0.1, 0.03
+WAY_M = 0.03
+WAY = JointBound(0.1, WAY_M)
 WRONG_SHARE = 0.3
 """Of that way, where commands must be rejected: a robot that does not reject them follows."""
 OLD_NS = 2_000_000_000
@@ -141,7 +143,6 @@ class Mover:
             )
         self._session, self._keys, self._profile = session, keys, profile
         self._joint = profile.robot.command == "joint"
-        self._way = WAY_RAD if self._joint else WAY_M
         self._source, self._other = (
             f"{name}#{secrets.token_hex(4)}" for name in ("conform", "other")
         )
@@ -159,12 +160,14 @@ class Mover:
             time.sleep(REST_S)
 
     def _trial(self, what: str) -> Trial:
-        asked = self._way * (WRONG_SHARE if what in rules.WRONG else 1.0)
+        share = WRONG_SHARE if what in rules.WRONG else 1.0
         with recording(self._session, self._keys, rules.ROBOT_KEYS) as kept:
             time.sleep(BEFORE_S)
             self._base = self._state(kept)
             if self._base is None:
-                return Trial(what, asked)
+                return Trial(what, share)
+            way = WAY.of(self._base.slides)[-1] if self._joint else WAY_M
+            asked = share * float(way)
             signed = -asked if self._gone > 0 else asked
             began_ns = time.time_ns()
             event_s = self._send(what, signed)

@@ -16,7 +16,15 @@ from vla_zenoh.kinematics.so3 import Pose, pose_distance, rotation_from_quat
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import CameraProfile
-from vla_zenoh.types import ActionChunk, ClockReply, Depth, JointState, PoseState, Task
+from vla_zenoh.types import (
+    ActionChunk,
+    ClockReply,
+    Depth,
+    JointBound,
+    JointState,
+    PoseState,
+    Task,
+)
 from vla_zenoh_conform.samples import Arrived, of_key
 
 LEAST_STATE_HZ = 20.0
@@ -26,7 +34,7 @@ RATE_SHARE = 0.7
 """Of the rate that was asked for."""
 APART_M, APART_RAD = 0.01, 0.05
 """Of the reported pose from that of the joints, as in the command node."""
-RANGE_RAD = 0.1
+RANGE = JointBound(0.1, 0.03)
 WIDTH_M = 0.01
 FOLLOWED, IGNORED = 0.8, 0.3
 """Shares of the way that commands asked for: a good stream is followed at least so far, a wrong one
@@ -205,7 +213,8 @@ def _joints(
     if not right:
         return
     measured = np.array([kinematics.joints_of(state) for state in joints])
-    low, high = kinematics.lower_rad - RANGE_RAD, kinematics.upper_rad + RANGE_RAD
+    beyond = RANGE.of(kinematics.slides)
+    low, high = kinematics.lower_rad - beyond, kinematics.upper_rad + beyond
     outside = np.any((measured < low) | (measured > high), axis=0).tolist()
     where = ", ".join(name for name, out in zip(kinematics.arm_joints, outside, strict=True) if out)
     text = f"out of range: {where}; degrees, or another zero?" if where else "within their ranges"

@@ -24,11 +24,11 @@ from vla_zenoh_policy_servers.state_vector import (
     PARTS,
     StateNumbers,
     parts_of,
-    sliding_joints,
     state_numbers,
 )
 
 from vla_zenoh.errors import RecordingError, SpecError
+from vla_zenoh.kinematics.description import sliding_joints
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation, StatePart
 from vla_zenoh.policy.meaning import ROTATION_FORMS, joints_as, unturned, wrapped
@@ -145,7 +145,7 @@ def worker_options(spec: ActionSpec, profile: Profile) -> dict[str, str]:
     if in_lerobots_numbers(spec):
         grips = spec.gripper != "none"
         options |= {each: LEROBOT[each] for each in LEROBOT if grips or "grip" not in each}
-        if sliding := sliding_joints(profile):
+        if sliding := sliding_joints(profile.robot):
             degree = options["joint_scale_rad"]
             units = ("1" if name in sliding else degree for name in spec.joints)
             options["joint_scale_rad"] = ",".join(units)

@@ -34,7 +34,7 @@ from vla_zenoh_inspect.targets import Targets
 REFUSED = "refused"
 FIRST_CHUNK_S = 20.0
 """A command node that is just starting has sent its task within this."""
-SETTLE_S, SETTLED_RAD, SETTLE_STEPS = 5.0, 0.01, 20
+SETTLE_S, SETTLE_STEPS = 5.0, 20
 NOTES = """\
 Joint targets in rad ({joints}), absolute; a gripper 0 (shut) to 1 (open). A target that the arm's
 limits do not allow (joint ranges, workspace box, table, keep-outs, itself) is refused before
@@ -194,9 +194,7 @@ class Arm(EmbodimentBase):
             self._send(target)
             self._pace()
         give_up_s = time.monotonic() + SETTLE_S
-        while (
-            np.abs(self._targets.apart(self._measured(), home))[: len(home_rad)].max() > SETTLED_RAD
-        ):
+        while not self._targets.settled(self._measured(), home):
             if time.monotonic() > give_up_s:
                 raise EmbodimentFault("the arm does not arrive at home: `vla-zenoh status` has why")
             self._driven()

@@ -13,9 +13,11 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.meaning import wrapped
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, JointBound
 
 GRIPPER = "gripper"
+SETTLED = JointBound(0.01, 0.003)
+"""Joints this near to home are there."""
 SHARE = 0.8
 """Of each joint's speed that one step may ask for: its motion is smoothed, too."""
 
@@ -43,6 +45,7 @@ class Targets:
         self._back = np.argsort(self._order)
         grips = profile.robot.gripper is not None
         self.labels = (*names, *[GRIPPER] * grips)
+        self._settled = SETTLED.of(kinematics.slides[self._order])
         self._endless = np.array([*kinematics.endless[self._order], *[False] * grips])
         ends = bounds.lower_rad[self._order], bounds.upper_rad[self._order]
         self.low = np.where(self._endless, -np.pi, [*ends[0], *[0.0] * grips])
@@ -85,3 +88,8 @@ class Targets:
     def apart(self, here: FloatArray, target: FloatArray) -> FloatArray:
         """(n,) from `here` to `target`."""
         return np.where(self._endless, wrapped(target - here), target - here)
+
+    def settled(self, here: FloatArray, target: FloatArray) -> bool:
+        """Whether the joints have arrived; the gripper may hold something."""
+        ways = np.abs(self.apart(here, target))[: len(self._settled)]
+        return bool((ways <= self._settled).all())

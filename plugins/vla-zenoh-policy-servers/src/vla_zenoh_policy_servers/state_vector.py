@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import MissingExtraError, ResourceError, SpecError
-from vla_zenoh.kinematics.description import Description
+from vla_zenoh.errors import MissingExtraError, SpecError
+from vla_zenoh.kinematics.description import sliding_joints
 from vla_zenoh.policy import Observation, StatePart
 from vla_zenoh.policy.meaning import (
     CLEAR,
@@ -43,7 +43,6 @@ from vla_zenoh.policy.meaning import (
 from vla_zenoh.policy.options import number
 from vla_zenoh.policy.spec import FIELD_OF
 from vla_zenoh.profile import Profile
-from vla_zenoh.resources import robot_urdf
 from vla_zenoh.types import FloatArray, JointState
 from vla_zenoh_policy_servers.action_semantics import HOME, METRIC, SCALED, StateUnits
 
@@ -300,7 +299,7 @@ def state_numbers(
             "the state has joint_deg, degrees from the profile's zero, and joint_zero or "
             "joint_scale_rad says another zero or direction: name joint, which has them"
         )
-    if "joint_deg" in names and (sliding := sliding_joints(profile)):
+    if "joint_deg" in names and (sliding := sliding_joints(profile.robot)):
         raise SpecError(
             f"the state has joint_deg, and {', '.join(sorted(sliding))} slides: name joint, with "
             "joint_scale_rad where others are in degrees"
@@ -313,16 +312,6 @@ def state_numbers(
     if grips and robot.no_gripper:
         raise SpecError(f"the state has {', '.join(grips)}, and {robot.no_gripper}: leave it out")
     return StateNumbers(tuple(names), robot.arm_joints, robot.max_width_m, units, near)
-
-
-def sliding_joints(profile: Profile) -> frozenset[str]:
-    """Joints that slide, whose positions are m; none where the robot's description is not here."""
-    try:
-        joints = Description(robot_urdf(profile.robot.description)).joints
-    except (ResourceError, MissingExtraError):
-        return frozenset()
-    arm = [joints[name] for name in profile.robot.arm_joints if name in joints]
-    return frozenset(joint.name for joint in arm if joint.unit == "m")
 
 
 def home_reference(profile: Profile) -> tuple[float, ...]:

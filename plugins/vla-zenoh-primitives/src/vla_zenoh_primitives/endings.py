@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of
-from vla_zenoh.types import FloatArray, GripperState, PoseState
+from vla_zenoh.types import FloatArray, GripperState, JointBound, PoseState
 from vla_zenoh_primitives.requests import Until
 
 NEAR_M, NEAR_RAD = 1e-3, 2e-3
+NEAR_JOINT = JointBound(NEAR_RAD, NEAR_M)
 """Tolerances of the measured state for a reached target."""
 SLOW_M_S, SLOW_RAD_S = 0.005, 0.02
 SETTLED_S = 0.1
@@ -58,7 +60,7 @@ class Arrival:
         pose: target of the TCP.
         joints_rad: (n,) joint target in the order of the kinematics; None: only the pose is
             checked.
-        arm: of these joints; None: none of them turns without an end.
+        arm: of these joints; None: all of them turn, and have ends.
     """
 
     def __init__(
@@ -69,26 +71,42 @@ class Arrival:
         self._gained_s = self._there_s = -np.inf
 
     def off(self, sight: Sight) -> tuple[float, float]:
-        """Distance of the TCP from the target, m; its angle, or the largest joint error, rad."""
+        """Distance of the TCP from the target, m; its angle, or that of the joints, rad."""
         off_m, off_rad = pose_distance(pose_of(sight.pose), self.pose)
-        target_rad = self.joints_rad
-        if target_rad is not None:
-            if self._arm is not None:
-                target_rad = self._arm.nearest(target_rad, sight.joints_rad)
-            off_rad = float(np.abs(sight.joints_rad - target_rad).max())
+        if self.joints_rad is not None:
+            off, slides = self._joints_off(sight, self.joints_rad)
+            off_rad = float(off[~slides].max(initial=0.0))
         return off_m, off_rad
 
-    def check(self, sight: Sight) -> str:
+    def _joints_off(
+        self, sight: Sight, target_rad: FloatArray
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """(n,) how far each joint is from its target, and which joints slide."""
+        slides = np.zeros(len(target_rad), bool)
+        if self._arm is not None:
+            target_rad, slides = self._arm.nearest(target_rad, sight.joints_rad), self._arm.slides
+        return np.abs(sight.joints_rad - target_rad), slides
+
+    def _left(self, sight: Sight) -> float:
+        """How far the arm is from its target, in tolerances.
+
+        With a joint target the TCP does not count: its error includes the arm's calibration.
+        """
+        if self.joints_rad is not None:
+            off, slides = self._joints_off(sight, self.joints_rad)
+            return float((off / NEAR_JOINT.of(slides)).max())
         off_m, off_rad = self.off(sight)
-        # With a joint target the TCP is not checked: its error includes the arm's calibration.
-        near = off_rad < NEAR_RAD and (off_m < NEAR_M or self.joints_rad is not None)
+        return max(off_m / NEAR_M, off_rad / NEAR_RAD)
+
+    def check(self, sight: Sight) -> str:
+        left = self._left(sight)
+        near = left < 1.0
         if not (near and sight.slow):
             self._there_s = -np.inf
         elif self._there_s == -np.inf:
             self._there_s = sight.now_s
         elif sight.now_s - self._there_s >= SETTLED_S:
             return "reached"
-        left = max(off_m / NEAR_M, off_rad / NEAR_RAD)
         if near or left < self._best * (1 - PROGRESS):
             self._best, self._gained_s = left, sight.now_s
         stuck = sight.now_s - self._gained_s > STUCK_S / max(sight.speed, LEAST_SPEED)

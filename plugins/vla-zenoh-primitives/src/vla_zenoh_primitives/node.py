@@ -30,7 +30,7 @@ from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.policy.meaning import joints_as, wrapped
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, HeldBox
-from vla_zenoh_primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
+from vla_zenoh_primitives.endings import NEAR_JOINT, Arrival, Ending, Gripped, RunEnding, Sight
 from vla_zenoh_primitives.policy import CHUNK_HZ, Target, TargetPolicy
 from vla_zenoh_primitives.requests import (
     MAX_REQUEST_BYTES,
@@ -327,11 +327,12 @@ class PrimitivesNode:
         names = self._profile.robot.arm_joints
         here_rad, arm = self._sight().joints_rad, self._check.kinematics
         asked_rad = arm.nearest(arm.ordered(names, target.joints_rad), here_rad)
-        off_rad = float(np.abs(here_rad - asked_rad).max())
+        off, near = np.abs(here_rad - asked_rad), NEAR_JOINT.of(arm.slides)
+        worst = int(np.argmax(off / near))
         return (
             f"this robot takes poses: the TCP is where these joints place it, the joints are up to "
-            f"{off_rad:.2g} rad away, because its controller keeps the elbow"
-            if off_rad > NEAR_RAD
+            f"{off[worst]:.2g} {arm.unit(worst)} away, because its controller keeps the elbow"
+            if off[worst] > near[worst]
             else ""
         )
 

@@ -15,12 +15,13 @@ from vla_zenoh.control.limits import BoundedStep, LimitHit, into_workspace, work
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import Pose, interpolate, pose_distance
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray, HeldBox
+from vla_zenoh.types import FloatArray, HeldBox, JointBound
 
 STEP_M, STEP_RAD = 0.01, 0.05
 STEP_S = 1.0
 """Duration of a step: the arm is slowed down where its joints need more time."""
 NEAR_M, NEAR_RAD = 5e-4, 1e-3
+NEAR_JOINT = JointBound(NEAR_RAD, NEAR_M)
 """The target is reached: half the tolerance of a primitive."""
 TRIES = 12
 """Before a barrier each step takes half of what is left."""
@@ -65,10 +66,10 @@ class TargetCheck:
         """The same of a straight motion of the joints to `target_rad` (n,), on the shortest way."""
         target_rad = self.kinematics.nearest(target_rad, joints_rad)
         lower_rad, upper_rad = self.bounds.lower_rad, self.bounds.upper_rad
-        names = self.kinematics.arm_joints
+        names, near = self.kinematics.arm_joints, NEAR_JOINT.of(self.kinematics.slides)
         for index, name in enumerate(names):
             low, high = float(lower_rad[index]), float(upper_rad[index])
-            if not low - NEAR_RAD <= target_rad[index] <= high + NEAR_RAD:
+            if not low - near[index] <= target_rad[index] <= high + near[index]:
                 unit = self.kinematics.unit(index)
                 return (
                     f"joint_limit: {name} at {target_rad[index]:.4g} {unit}, its range is "
@@ -85,7 +86,7 @@ class TargetCheck:
             for _ in range(TRIES):
                 step = _last(self.bounds.bound_in_pieces(at, aim))
                 at, hits = step.joints_rad, step.hits
-                if float(np.abs(aim - at).max()) < NEAR_RAD:
+                if (np.abs(aim - at) < near).all():
                     break
             else:
                 forward = self.kinematics.forward

@@ -10,6 +10,7 @@ import numpy as np
 
 from vla_zenoh.control.policy_check import Finding, error, joints_as_pose
 from vla_zenoh.errors import SpecError
+from vla_zenoh.kinematics.description import sliding_joints
 from vla_zenoh.lab.check import judge
 from vla_zenoh.lab.check.examples import (
     MAX_WIDTH_M,
@@ -283,10 +284,12 @@ class Examination:
         except SpecError as fault:
             findings.append(error(fault.reason, f"{style.name}: {fault}"))
             return None
-        findings += check_chunk(action, steps, self._limits, self._width_m)
-        if self._profile is not None:
-            home_rad = np.array(self._profile.robot.home_rad)
-            findings += joints_as_pose(action, steps, home_rad, self._limits)
+        robot = None if self._profile is None else self._profile.robot
+        findings += check_chunk(action, steps, self._limits, self._width_m, robot)
+        if robot is not None:
+            slides = np.isin(robot.arm_joints, [*sliding_joints(robot)])
+            home_rad = np.array(robot.home_rad)
+            findings += joints_as_pose(action, steps, home_rad, slides, self._limits)
         self._answers.append((style, steps))
         # A model with real-time chunking gets committed steps at the next inference.
         arrival_ns = observation.stamp_wall_ns + round(took_s * 1e9)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.control.actions import chunk_poses
 from vla_zenoh.control.policy_check import (
@@ -21,10 +22,12 @@ from vla_zenoh.control.policy_check import (
     spec_errors,
     wrong_rate,
 )
+from vla_zenoh.kinematics.description import sliding_joints
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec
 from vla_zenoh.policy.meaning import wrapped
-from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
+from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile, RobotProfile
+from vla_zenoh.types import JointBound
 
 SHAPE_TOLERANCE = 0.02
 """An image may be stretched by this share of its aspect ratio without a note."""
@@ -132,18 +135,26 @@ def _robot(profile: Profile, spec: ModelSpec, worker: str) -> Iterator[Finding]:
 
 # -- a chunk --------------------------------------------------------------------------------------
 def check_chunk(
-    spec: ActionSpec, steps: Steps, limits: Limits, max_width_m: float
+    spec: ActionSpec,
+    steps: Steps,
+    limits: Limits,
+    max_width_m: float,
+    robot: RobotProfile | None = None,
 ) -> list[Finding]:
     """Findings about the numbers of one chunk.
 
     Args:
         steps: (H, D), as `vla_zenoh.policy.check_steps` gives them.
+        robot: whose joints they move; None: not known.
     """
-    found = list(chunk_errors(spec, steps, limits, max_width_m))
+    sliding = () if robot is None else sliding_joints(robot)
+    found = list(chunk_errors(spec, steps, limits, max_width_m, sliding))
     if {"quaternion", "rotation_6d"} & {each.name for each in found}:
         return found  # there is no pose to look at
     if spec.space == "joint":
-        found += _joint_steps(spec, steps, limits)
+        names = () if robot is None else robot.arm_joints
+        fast = dict(zip(names, limits.joint.of("velocity_rad_s", len(names)), strict=True))
+        found += _joint_steps(spec, steps, limits, np.isin(spec.joints, [*sliding]), fast)
     elif spec.kind == "absolute":
         found += _targets(spec, steps, limits)
     else:
@@ -167,8 +178,14 @@ def _targets(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding
         )
 
 
-def _joint_steps(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding]:
-    """As `_steps`, of the joint that is fastest for its limit."""
+def _joint_steps(
+    spec: ActionSpec,
+    steps: Steps,
+    limits: Limits,
+    slides: NDArray[np.bool_],
+    fast: Mapping[str, float],
+) -> Iterator[Finding]:
+    """As `_steps`, of the joint that is fastest for its limit: by name in `fast`, or the least."""
     joints = np.asarray(steps[:, : spec.arm_size], np.float64)
     if spec.kind == "velocity":
         joints = joints * spec.dt_s
@@ -177,20 +194,27 @@ def _joint_steps(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Fin
         if spec.turns == "wrapped":  # more than half a turn is a step over pi
             joints = wrapped(joints)
     ways = np.abs(joints).max(axis=0, initial=0.0)
-    if (not spec.targets) and ways.max() > limits.step_rad * (1 + ROUNDING):
-        if ways.max() > REJECT_FACTOR * limits.step_rad:
+    units = np.where(slides, "m", "rad")
+    most = JointBound(limits.step_rad, limits.step_m).of(slides)
+    worst = int(np.argmax(ways / most))
+    if (not spec.targets) and ways[worst] > most[worst] * (1 + ROUNDING):
+        if ways[worst] > REJECT_FACTOR * most[worst]:
             return  # an error
+        unit = units[worst]
         yield warning(
             "step_limit",
-            f"a step of a joint of {ways.max():.4g} rad, the limit is {limits.step_rad:g} rad",
+            f"a step of a joint of {ways[worst]:.4g} {unit}, the limit is {most[worst]:g} {unit}",
         )
-    least_rad_s = min(limits.joint.velocity_rad_s)
-    fastest_rad_s = float(ways.max()) / spec.dt_s
-    if fastest_rad_s > least_rad_s * (1 + 1e-3):
+    least = min(limits.joint.velocity_rad_s)
+    most = np.array([fast.get(name, least) for name in spec.joints])
+    worst = int(np.argmax(ways / most))
+    speed = float(ways[worst]) / spec.dt_s
+    if speed > most[worst] * (1 + 1e-3):
+        unit = units[worst]
         yield warning(
             "speed_limit",
-            f"a joint moves by {ways.max():.4g} rad in {spec.dt_s:g} s, {fastest_rad_s:.3g} rad/s; "
-            f"the slowest joint's limit is {least_rad_s:g}: the arm may come later than asked",
+            f"a joint moves by {ways[worst]:.4g} {unit} in {spec.dt_s:g} s, {speed:.3g} {unit}/s; "
+            f"its limit is {most[worst]:g}: the arm may come later than asked",
         )
 
 

@@ -91,6 +91,7 @@ class Lockstep:
                 partial(self._measure, name),
                 self._arm(name).joint_range_rad,
                 np.full(len(profile.of_part(name).robot.arm_joints), np.inf),
+                self._arm(name).slides,
                 TICK_NS / 1e9,
             )
             for name in profile.part_names
