@@ -171,7 +171,8 @@ def _say(attempt: StopAttempt, robot: str, found: StopProgress, *, as_json: bool
             "outcome": found.outcome.value,
             "robot": robot,
             "heard_by": list(found.heard_by),
-            "speed_rad_s": found.speed_rad_s,
+            "speed_rad_s": found.speed and found.speed.rad_s,
+            "speed_m_s": found.speed and found.speed.m_s,
             "message": sentence,
         }
         print(json.dumps(line), flush=True)

@@ -176,12 +176,19 @@ class StopOutcome(StrEnum):
     NOT_CONFIRMED = "not_confirmed"  # no answer: it may have arrived all the same
 
 
+class JointSpeed(NamedTuple):
+    """Of the fastest joint that turns, and of the fastest that slides."""
+
+    rad_s: float
+    m_s: float
+
+
 class StopProgress(NamedTuple):
-    """What is known of a stop: nodes that latched it, and speed of the fastest joint, or None."""
+    """What is known of a stop: nodes that latched it, and how fast the joints are, or None."""
 
     outcome: StopOutcome
     heard_by: tuple[str, ...]
-    speed_rad_s: float | None
+    speed: JointSpeed | None
 
     def sentence(self, robot: str, why: str = "") -> str:
         """The outcome for a person, in the words of every way of stopping; `why` no answer came."""
@@ -189,8 +196,10 @@ class StopProgress(NamedTuple):
         if self.outcome is StopOutcome.CONFIRMED:
             return f"CONFIRMED: {robot} is stopped and stands, by {by}"
         if self.outcome is StopOutcome.HEARD:
-            speed = self.speed_rad_s
-            moves = "no joint states come" if speed is None else f"fastest joint {speed:.3f} rad/s"
+            moves = "no joint states come"
+            if self.speed is not None:
+                moves = f"fastest joint {self.speed.rad_s:.3f} rad/s"
+                moves += f" or {self.speed.m_s:.3f} m/s" if self.speed.m_s else ""
             return f"HEARD: by {by} of {robot}; {moves}"
         return (
             f"NOT CONFIRMED: no answer of {robot}{why and f': {why}'}. The stop may still have "
@@ -208,26 +217,31 @@ class Standstill:
     def take(self, sample: zenoh.Sample) -> None:
         """Take a joint state; runs on Zenoh's thread."""
         self._newest = ReceivedSample(sample, time.monotonic_ns())
-        if self._moves(0.0):
-            self._moved_s = time.monotonic()
+        speed = self.speed(0.0)
+        if speed is not None:
+            from vla_zenoh.types import STANDING
 
-    def _moves(self, since_s: float) -> bool | None:
-        """Whether a joint moves; None: no valid state came since then, or for `STATE_AGE_S`."""
+            if speed.rad_s > STANDING.turns or speed.m_s > STANDING.slides:
+                self._moved_s = time.monotonic()
+
+    def speed(self, since_s: float) -> JointSpeed | None:
+        """None: no valid state came since then, or for `STATE_AGE_S`."""
         newest, now_s = self._newest, time.monotonic()
         if newest is None or newest.mono_ns < max(since_s, now_s - STATE_AGE_S) * 1e9:
             return None
-        from vla_zenoh.types import STANDING, JointState  # brings numpy, when the stop is out
+        from vla_zenoh.types import JointState  # brings numpy, when the stop is out
 
         try:
             state = records.decode(JointState, bytes_of(newest.sample.payload, records.SMALL_BYTES))
         except CodecError:
             return None
-        return bool((abs(state.velocity_rad_s) > STANDING.of(state.slides)).any())
+        speeds, slides = abs(state.velocity_rad_s), state.slides
+        return JointSpeed(*(float(speeds[each].max(initial=0.0)) for each in (~slides, slides)))
 
     def stands(self, since_s: float) -> bool:
         """No joint has moved for `STANDS_S`, and states still come."""
         quiet_s = time.monotonic() - max(self._moved_s, since_s)
-        return quiet_s >= STANDS_S and self._moves(since_s) is not None
+        return quiet_s >= STANDS_S and self.speed(since_s) is not None
 
 
 class StopClient(NodeRegistry):
@@ -318,13 +332,14 @@ class StopClient(NodeRegistry):
             and (name == "command" and status.state == "stopped")
             | bool(status.detail.get("stop_latched"))
         )
-        speeds = [watch.speed_rad_s(self._stop_s) for watch in self._standstill]
+        speeds = [watch.speed(self._stop_s) for watch in self._standstill]
         known = [speed for speed in speeds if speed is not None]
+        fastest = JointSpeed(*map(max, zip(*known, strict=True))) if known else None
         stands = bool(speeds) and all(watch.stands(self._stop_s) for watch in self._standstill)
         outcome = StopOutcome.NOT_CONFIRMED
         if heard_by:
             outcome = StopOutcome.CONFIRMED if stands else StopOutcome.HEARD
-        return StopProgress(outcome, heard_by, max(known, default=None))
+        return StopProgress(outcome, heard_by, fastest)
 
     def stopped(self) -> bool:
         """Whether a node has said since the last `stop` that it is stopped, and the arm stands."""

@@ -34,7 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.limits import LimitHit, stop_s_of, workspace_corners
+from vla_zenoh.control.limits import LimitHit, bound_norm, stop_s_of, workspace_corners
 from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose
@@ -151,6 +151,7 @@ class JointFollower:
         velocity_share: part of the URDF's joint velocities that is used.
         margin_rad: kept from both ends of every joint's range, one number or (n,).
         singularity_stop: s_stop, below which the arm does not go by itself.
+        lead: m and rad from the TCP to the furthest target that is followed as it is.
     """
 
     def __init__(
@@ -164,6 +165,7 @@ class JointFollower:
         velocity_share: float = 1.0,
         margin_rad: float | FloatArray = 0.05,
         singularity_stop: float = 0.015,
+        lead: tuple[float, float] = (math.inf, math.inf),
     ) -> None:
         self.kinematics, self.constraints = kinematics, constraints
         self.posture_rad = posture_rad
@@ -174,7 +176,7 @@ class JointFollower:
         self.velocity_rad_s = velocity_share * kinematics.velocity_rad_s
         self.lower_rad = kinematics.lower_rad + margin_rad
         self.upper_rad = kinematics.upper_rad - margin_rad
-        self._singularity_stop = singularity_stop
+        self._singularity_stop, self._lead = singularity_stop, lead
         self._near_end, self._posture = (
             NEAR_END.of(kinematics.slides),
             POSTURE.of(kinematics.slides),
@@ -186,14 +188,18 @@ class JointFollower:
         """The joints one tick later, and the limits that acted.
 
         They keep to their ranges, velocities and accelerations, whatever the target: the pose of
-        the TCP then, and its `twist` (6,), m/s and rad/s in base axes. The limits are
-        ``joint_velocity``, ``joint_limit``, ``singularity``, and the distance constraints.
+        the TCP then, and its `twist` (6,), m/s and rad/s in base axes. One that is further than
+        `lead` is followed as if it were so far in its direction. The limits are ``lead_m``,
+        ``lead_rad``, ``joint_velocity``, ``joint_limit``, ``singularity``, and the distance
+        constraints.
         """
         joints, velocity = now.position_rad, now.velocity_rad_s
         here, jacobian = self.kinematics.pose_and_jacobian(joints)
-        error = pose_error(target, here)
+        way, (lead_m, lead_rad) = pose_error(target, here), self._lead
+        way_m, hits = bound_norm("lead_m", way[:3], lead_m)
+        turn, turned = bound_norm("lead_rad", way[3:], lead_rad)
+        error, hits = np.concatenate([way_m, turn]), hits + turned
         singular_value = smallest_singular_value(jacobian)
-        hits: list[LimitHit] = []
         if singular_value < DAMPED_BELOW:
             hits.append(LimitHit("singularity", singular_value, DAMPED_BELOW))
         low, high = self._allowed(now, dt_s)

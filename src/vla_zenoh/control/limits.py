@@ -178,8 +178,8 @@ def bound_step(limits: Limits, before: Pose, asked: Pose) -> tuple[Pose, list[Li
     """
     way_m = asked.position_m - before.position_m
     turn = log3(asked.rotation @ before.rotation.T)
-    way_m, hits = _bound_norm("step_m", way_m, limits.step_m)
-    turn, hit = _bound_norm("step_rad", turn, limits.step_rad)
+    way_m, hits = bound_norm("step_m", way_m, limits.step_m)
+    turn, hit = bound_norm("step_rad", turn, limits.step_rad)
     hits += hit
     inside, overshoot_m = into_workspace(limits, before.position_m + way_m, before.position_m)
     if overshoot_m > 0:
@@ -189,7 +189,8 @@ def bound_step(limits: Limits, before: Pose, asked: Pose) -> tuple[Pose, list[Li
     return Pose(inside, orthonormal(exp3(turn) @ before.rotation)), hits
 
 
-def _bound_norm(name: str, vector: FloatArray, limit: float) -> tuple[FloatArray, list[LimitHit]]:
+def bound_norm(name: str, vector: FloatArray, limit: float) -> tuple[FloatArray, list[LimitHit]]:
+    """`vector` (3,) no longer than `limit`, and the limit if it acted."""
     norm = norm3(vector)
     if norm <= limit * (1 + 1e-6):  # float32 steps of exactly the limit are within it
         return vector, []

@@ -126,6 +126,11 @@ class MotionPipeline:
         """(n,) joints commanded, None where poses are."""
         return self._mover.joints_rad
 
+    @property
+    def strays_m(self) -> float:
+        """How far beside these places, in the motion in progress, the arm may come to rest."""
+        return self._mover.strays_m
+
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
         """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
         return self._mover.stopping_rad(ahead_s)

@@ -2,9 +2,10 @@
 
 Each tick the joints at which either arm would come to rest are computed, were it to brake one tick
 later. No pair of places on the two ways there may be nearer than ``limits.reach.part_stop_m`` and
-`SPARE_M`: so it does not matter which of the two stops first, or whether one of them stops at all.
-Otherwise both brake, on ways that the tick before found to be free. Once they stand they go on when
-the first bit of the way towards their goals is free, for one arm alone and for both. Below
+what the arms may stray from them: so it does not matter which of the two stops first, or whether
+one of them stops at all. Otherwise both brake, on ways that the tick before found to be free. Once
+they stand they go on when the first bit of the way towards their goals is free, for one arm alone
+and for both. Below
 ``part_slow_m`` arms that come nearer are slowed down to sqrt(distance left / zone) of their speed.
 
 Arms that begin too near to each other may only move apart.
@@ -35,9 +36,6 @@ SPACED_M = 0.25
 """Arms this much further apart than they may come are looked at as often as joints alone."""
 NOISE_M = 2e-5
 """Distances of the same joints differ by less: without it arms at the stop could not go on."""
-SPARE_M = 5e-3
-"""Arms that brake end this much before the stop: joints that begin to lag in a brake end elsewhere
-than their pose would. 3.4 mm were found in 2.5 million ticks of ``fuzz_parts.py``."""
 LEAST_NEAR_PART = 0.05
 """Least share of the speed near the stop: the arms are held there, and have to come away again."""
 STANDS = JointBound(2e-3, 6e-4)
@@ -104,7 +102,8 @@ class PartSpacing:
         if self.nearest.distance_m >= self._within_m:  # which fast arms may need for their stops
             self._skip = self._check_ticks - 1
             ahead_s *= self._check_ticks
-        floor_m = self._floor_m(self.nearest.distance_m)
+        spare_m = 2 * max(part.motion.strays_m for part in self._parts)
+        floor_m = self._floor_m(self.nearest.distance_m, self._stop_m + spare_m)
         stops = [part.motion.stopping_rad(ahead_s) for part in self._parts]
         ahead = self._nearest(at, floor_m + NOISE_M, stops)
         # A brake that is given up and begun again would end further on.
@@ -121,13 +120,12 @@ class PartSpacing:
             return None, LimitHit(NAME, near.distance_m, self._stop_m, where=str(near))
         return self._slow(before), None
 
-    def _floor_m(self, now_m: float) -> float:
-        """The least distance allowed ahead of arms that are `now_m` apart.
+    def _floor_m(self, now_m: float, least_m: float) -> float:
+        """The least distance allowed ahead, `least_m` or less, of arms that are `now_m` apart.
 
         Those that are too near to each other must not come nearer again: were each look compared
         with the one before it, slow arms would pass the stop by `NOISE_M` at a time.
         """
-        least_m = self._stop_m + SPARE_M
         if now_m < self._reached_m - NOISE_M:  # they came nearer in a brake, by what they lagged
             self._reached_m = now_m
         self._reached_m = max(self._reached_m, min(now_m, least_m))

@@ -498,10 +498,9 @@ class Settling:
         held, held_rad = held_pose(measured), None
         if self._kinematics is not None and joint is not None:
             held_rad = held_joints(self._kinematics, joint)
-        if self._standing is not None:
-            before, before_rad, _ = self._standing
-            moved = *pose_distance(held, before), *_ways(held_rad, before_rad)
-        if self._standing is None or max(moved) > SETTLED:
+        before, before_rad, _ = self._standing or (held, held_rad, received_ns)
+        moved = max(*pose_distance(held, before), *_ways(held_rad, before_rad)) > SETTLED
+        if self._standing is None or moved:
             self._standing = held, held_rad, received_ns
         self._measured_ns = received_ns
 

@@ -163,6 +163,8 @@ class PosePath(Smoother):
 
     stuck = ""
     """Why the arm will not reach its goal, empty while it follows."""
+    strays_m = 0.0
+    """How far beside all places of `stopping_rad` it may come to rest."""
 
     def __init__(self, profile: Profile, *, inside: bool = True) -> None:
         start = Pose(np.zeros(3), np.eye(3))  # until `reset`

@@ -240,6 +240,22 @@ def test_a_face_of_the_box_holds_where_the_easiest_joint_brakes_as_hard_as_it_ca
     assert (slower <= high).all()
 
 
+def test_a_goal_beyond_the_leash_is_followed_as_one_on_it_and_told() -> None:
+    """Such goals do not come from the pipeline."""
+    follower, here = PoseToJoint(profile(), KINEMATICS)._follower, KINEMATICS.forward(HOME_RAD)
+    standing, along, turn = JointMotion.standing(HOME_RAD), np.array([0.6, -0.8, 0.0]), np.eye(3)[2]
+    lead_m, lead_rad = BASE.limits.lead_m, BASE.limits.lead_rad
+    reached, told = [], []
+    for far in (1.0, 3.0):
+        there_m = here.position_m + far * lead_m * along
+        target = Pose(there_m, exp3(far * lead_rad * turn) @ here.rotation)
+        moved, hits = follower.step(standing, target, np.zeros(6), TICK_S)
+        reached.append(moved.velocity_rad_s)
+        told.append({hit.name for hit in hits if "lead" in hit.name})
+    assert reached[1] == pytest.approx(reached[0], rel=RTOL)
+    assert told == [set(), {"lead_m", "lead_rad"}]
+
+
 def test_an_arm_that_begins_outside_of_the_box_is_led_in() -> None:
     arm = Arm(profile())
     inside = KINEMATICS.forward(HOME_RAD)

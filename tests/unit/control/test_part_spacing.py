@@ -71,6 +71,7 @@ class Arms:
         for part in self.parts:
             part.motion = SimpleNamespace(
                 joints_rad=leaning(share),
+                strays_m=JointPath.strays_m,
                 stopping_rad=lambda _: [end],
                 wanted_rad=lambda _: leaning(2.0),
             )
@@ -108,6 +109,7 @@ def test_arms_stand_before_their_stop_however_slowly_they_come_nearer(share_s: f
         for part in arms.parts:
             part.motion = SimpleNamespace(
                 joints_rad=leaning(share),
+                strays_m=JointPath.strays_m,
                 stopping_rad=lambda _, end=ahead: [end],
                 wanted_rad=lambda _: leaning(2.0),
             )

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
+import pinocchio as pin
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,7 +17,7 @@ from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.control.pose_to_joint import FollowedPath, PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import Smoother
-from vla_zenoh.control.states import State
+from vla_zenoh.control.states import MotionMode, State
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.profile import load_profile, override
@@ -29,6 +33,7 @@ START_NS = 1_700_000_000_000_000_000
 RTOL = 1e-6
 MOVING_RAD_S = 0.05
 BOX_M = 1e-5
+LEAST_STOP_M = 0.005  # of part_stop_m
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 60)), min_size=1, max_size=6))
@@ -169,3 +174,49 @@ def test_joints_that_are_held_stop_with_a_pose_that_stands() -> None:
     for _ in range(125):
         stage.tick(stream, braking=True, elbow=False)
     assert stage.at_rest
+
+
+def braked_from(path: FollowedPath) -> FloatArray:
+    """The joints after one more tick and a brake, of a copy."""
+    ahead = copy(path)
+    ahead.joints = copy(path.joints)
+    ahead.joints._follower = copy(path.joints._follower)
+    ahead.step(MotionMode.FOLLOW)
+    while not ahead.stands:
+        ahead.pause()
+        ahead.step(MotionMode.PAUSE)
+    return ahead.joints_rad
+
+
+def links_m(joints_rad: FloatArray) -> FloatArray:
+    """(n, 3) where the links are."""
+    data = KINEMATICS.model.createData()
+    pin.forwardKinematics(KINEMATICS.model, data, joints_rad)
+    return np.array([frame.translation for frame in data.oMi])
+
+
+@pytest.mark.parametrize(("seed", "ticks"), [(3, 200), (1, 140)])
+def test_an_arm_that_brakes_ends_near_a_place_that_was_said_before(seed: int, ticks: int) -> None:
+    """Two arms that are as wrong, towards each other, do not touch at the least stop."""
+    of, random = load_profile("two_pandas_sim").of_part("left"), np.random.default_rng(seed)
+    path, home_rad = FollowedPath(of, PoseToJoint(of, KINEMATICS)), np.array(of.robot.home_rad)
+    start_rad = home_rad + random.uniform(-0.3, 0.3, len(home_rad))
+    path.joints.restart(start_rad)
+    path.reset(KINEMATICS.forward(start_rad))
+    asked, changes, worst_m = Goal(path.motion.pose, 0.04), 0, 0.0
+    for tick in range(ticks):
+        if tick >= changes:
+            changes = tick + int(random.integers(5, 120))
+            there_m = random.uniform(*of.limits.tcp_box.corners_m)
+            turn = exp3(0.6 * random.normal(size=3)) @ KINEMATICS.forward(home_rad).rotation
+            asked = Goal(Pose(there_m, turn), 0.04)
+        goal, _ = path.leash(asked, TICK_S)
+        if tick % 5 == 0:
+            path.go_to(goal, path.shares(goal))
+        path.step(MotionMode.FOLLOW)
+        if tick % 8 == 0 and not path.stands:
+            said = [links_m(place_rad) for place_rad in path.stopping_rad(TICK_S)]
+            ended = links_m(braked_from(path))
+            off_m = [np.linalg.norm(place - ended, axis=1).max() for place in said]
+            worst_m = max(worst_m, min(off_m))
+    assert 2 * worst_m < LEAST_STOP_M + 2 * path.strays_m
