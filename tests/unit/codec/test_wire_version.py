@@ -46,7 +46,7 @@ FIELDS = {
         "worker chunk_seq spec_hash episode observation_stamp_ns prompt steps inference_ms raw done"
     ),
     "JointCommand": "names position_rad velocity_rad_s acceleration_rad_s2 state cause",
-    "JointState": "names position_rad velocity_rad_s effort_nm reference_rad endless",
+    "JointState": "names position_rad velocity_rad_s effort_nm reference_rad endless sliding",
     "NodeStatus": (
         "node state host pid started_wall_ns ages_s rates_hz latency_ms counters detail boot"
     ),
