@@ -9,6 +9,7 @@ the pose follows them. An arm that stops does not make up for its lag.
 
 from __future__ import annotations
 
+import math
 from copy import copy
 
 import numpy as np
@@ -66,8 +67,8 @@ OUTSIDE_M = 1e-3
 """An arm further outside the box than this started there, and is moved inside."""
 LENGTH_DAMPING = 1e-5 * np.eye(6)
 """Of the inverse for lengths alone: at a singularity they are large, and finite."""
-ENDS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Places from the end of a pose's brake to that of the joints' own."""
+PIECE, MOST_PIECES = JointBound(0.01, 0.003), 4
+"""The way from the end of a pose's brake to that of the joints' own is looked at in such pieces."""
 RESTING_STEPS = 2
 """Newton steps to the joints of a resting pose."""
 ELBOW_S = 0.1
@@ -108,7 +109,7 @@ class PoseToJoint:
         self._pull_1_s = min(PULL_1_S, most**0.5)
         self._longest = posture / POSTURE_1_S
         """(n,) a posture further away pulls no faster."""
-        self._rest = REST.of(kinematics.slides)
+        self._rest, self._piece = REST.of(kinematics.slides), PIECE.of(kinematics.slides)
         self._dt_s, self._check_ticks = 1.0 / profile.timing.command_hz, check_ticks(profile)
         self._held_by: set[str] = set()
         self.restart(home_rad)
@@ -185,8 +186,10 @@ class PoseToJoint:
             at_rest = at_rest + _joint_way(jacobian, pose_error(rest, here))
         acceleration, box = self._now.acceleration_rad_s2, np.array(self.limits)
         lagging = joints + stop_way(velocity, acceleration, box, ahead_s)
-        ends = [at_rest + share * (lagging - at_rest) for share in ENDS]
-        return [0.5 * (joints + at_rest), 0.5 * (joints + lagging), *ends]
+        apart = lagging - at_rest
+        pieces = math.ceil(min(float((np.abs(apart) / self._piece).max()), MOST_PIECES)) or 1
+        ends = [at_rest + number / pieces * apart for number in range(pieces + 1)]
+        return [0.5 * (joints + at_rest), *ends]
 
     def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
         """Advance `smoother` by one tick and follow its pose, or come to rest if `braking`.
