@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import held_pose
@@ -100,6 +101,10 @@ class _EnvironmentWorld:
     @property
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
         return np.full(JOINTS, -3.0), np.full(JOINTS, 3.0)
+
+    @property
+    def slides(self) -> NDArray[np.bool_]:
+        return np.zeros(JOINTS, bool)
 
     def begin(self, delay_ns: int) -> None:
         if self._next_ns is None:
