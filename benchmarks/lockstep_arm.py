@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 from vla_zenoh_benchmarks.lockstep.worker import Delays
 
@@ -44,6 +45,11 @@ class PerfectArm:
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
         """Least and greatest position of every arm joint, (n,) each."""
         return self._kinematics.lower_rad, self._kinematics.upper_rad
+
+    @property
+    def slides(self) -> NDArray[np.bool_]:
+        """Which arm joints slide, (n,)."""
+        return self._kinematics.slides
 
     def tick(self, reference: PoseReference | JointReference) -> None:
         """A millisecond: TCP or joints are there; the TCP's joints follow without their elbow."""
@@ -94,7 +100,7 @@ def activated(
     Raises:
         RuntimeError: it could not be activated; says why.
     """
-    world: Any = PerfectArm(profile) if perfect else build_world(profile)
+    world = PerfectArm(profile) if perfect else build_world(profile)
     loop = Lockstep(
         profile, world, policy, delays=delays, reach=ReachabilityFilter(profile), seed=seed
     )

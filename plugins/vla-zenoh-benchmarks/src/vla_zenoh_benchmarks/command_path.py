@@ -47,7 +47,7 @@ def run_through_command_node(clock: EpisodeClock, conditions: EpisodeConditions)
     world = _EnvironmentWorld(clock)
     policy = _AskedPolicy(clock, world)
     delays = Delays((conditions.delay_ms or 0.0) / 1e3)
-    loop = Lockstep(profile, world, policy, delays=delays)  # pyright: ignore[reportArgumentType]
+    loop = Lockstep(profile, world, policy, delays=delays)
     world.loop, policy.delay_ns = loop, round(delays.inference_s * 1e9)
     taken = conditions.replan or clock.spec.action.horizon
     loop.put("rate", min(100.0, 1.0 / (taken * clock.spec.action.dt_s)))

@@ -8,9 +8,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import (
@@ -34,10 +35,14 @@ from vla_zenoh.types import (
     ActionChunk,
     Depth,
     Event,
+    FloatArray,
     GripperCommand,
+    GripperState,
     Header,
     HeldBox,
     Image,
+    JointState,
+    PoseState,
     Stamped,
     Task,
 )
@@ -49,14 +54,31 @@ from vla_zenoh_benchmarks.lockstep.worker import (
     Tamper,
 )
 
-if TYPE_CHECKING:
-    from vla_zenoh.simulation.world import SimulatedPart, World
-
 TICK_NS = 1_000_000
 """One step of the world."""
 START_NS = 1_700_000_000_000_000_000
 """Start of the virtual wall clock."""
 SIM, CAMERA, COMMAND = "sim", "camera", "command"
+
+
+class LockstepArm(Protocol):
+    """An arm of what the loop steps, see `simulation.world.SimulatedPart`."""
+
+    @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]: ...
+    @property
+    def slides(self) -> NDArray[np.bool_]: ...
+    def tcp(self) -> tuple[FloatArray, FloatArray]: ...
+    def joint_state(self) -> JointState: ...
+    def pose_state(self, reference: Any, /) -> PoseState: ...
+    def gripper_state(self) -> GripperState: ...
+    def set_gripper(self, width_m: float, speed_m_s: float, force_n: float, /) -> None: ...
+
+
+class LockstepWorld(LockstepArm, Protocol):
+    """What the loop steps: the simulated `World`, or what stands in for it, of one arm."""
+
+    def tick(self, reference: Any, /) -> None: ...
 
 
 class Lockstep:
@@ -72,7 +94,7 @@ class Lockstep:
     def __init__(
         self,
         profile: Profile,
-        world: World,
+        world: LockstepWorld,
         policy: Policy,
         *,
         delays: Delays | None = None,
@@ -81,7 +103,8 @@ class Lockstep:
         seed: int = 0,
         others: Mapping[str, Policy] | None = None,
     ) -> None:
-        self.profile, self.world = profile, world
+        self.profile = profile
+        self.world: Any = world
         self.delays = delays or Delays()
         self.now_ns = START_NS
         self.commander = Commander(profile, reach=reach)
@@ -196,7 +219,7 @@ class Lockstep:
         references = {name: guard.tick(now_ns) for name, guard in self.guards.items()}
         self.world.tick(references.get("", references))
 
-    def _arm(self, part: str) -> World | SimulatedPart:
+    def _arm(self, part: str) -> LockstepArm:
         return self.world.parts[part] if part else self.world
 
     def _measure(self, part: str) -> Measured:
