@@ -17,8 +17,8 @@ UNHEARD = (
 
 
 def _say_unheard() -> None:
-    unknown = {"robot": None, "heard_by": [], "speed_rad_s": None, "message": UNHEARD}
-    line = json.dumps({"ok": False, "outcome": "not_confirmed", **unknown})
+    unknown = {"robot": None, "heard_by": [], "speed_rad_s": None, "speed_m_s": None}
+    line = json.dumps({"ok": False, "outcome": "not_confirmed", **unknown, "message": UNHEARD})
     print(line if "--json" in sys.argv else UNHEARD, flush=True)
 
 

@@ -26,6 +26,7 @@ from vla_zenoh_benchmarks.disagreement import (
 from vla_zenoh.control.policy_check import Lease, chunk_errors, validate_chunk
 from vla_zenoh.control.preflight import CHUNK_PATIENCE_S
 from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.description import sliding_joints
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import pose_of
 from vla_zenoh.policy import ModelSpec
@@ -124,6 +125,9 @@ class WorkerWatch:
         self._profile, self.worker = profile, worker
         self.spec: ModelSpec | None = None
         self.pending: deque[ActionChunk] = deque(maxlen=MAX_PENDING)
+        self._sliding = {
+            part: sliding_joints(profile.of_part(part).robot) for part in profile.part_names
+        }
         self._lease: Lease | None = None
         self._source, self._restarts, self._chunks = "", 0, 0
         self._inference_ms: list[float] = []
@@ -169,7 +173,8 @@ class WorkerWatch:
             own, action = self._profile.of_part(part), lease.spec.action
             steps = chunk.record.steps[:, action.columns(part)]
             width_m = own.robot.max_width_m
-            for error in chunk_errors(action.of(part), steps, own.limits, width_m):
+            sliding = self._sliding.get(part, frozenset())
+            for error in chunk_errors(action.of(part), steps, own.limits, width_m, sliding):
                 return error.name
         return ""
 
