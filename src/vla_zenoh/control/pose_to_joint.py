@@ -314,7 +314,7 @@ class FollowedPath(PosePath):
 
     strays_m = 5e-3
     """Joints that begin to lag in a brake end up to 6.4 mm from all places of `stopping_rad`, by
-    1200 brakes on the way to goals that jump: two such arms, each kept this far before the least
+    2700 brakes on the way to goals that jump: two such arms, each kept this far before the least
     ``part_stop_m``, 5 mm, do not touch."""
 
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:

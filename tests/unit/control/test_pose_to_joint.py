@@ -195,7 +195,13 @@ def links_m(joints_rad: FloatArray) -> FloatArray:
     return np.array([frame.translation for frame in data.oMi])
 
 
-@pytest.mark.parametrize(("seed", "ticks"), [(3, 200), (1, 140)])
+@pytest.mark.parametrize(
+    ("seed", "ticks"),
+    [
+        *((3, 200), (1, 140)),
+        *(pytest.param(seed, 1200, marks=pytest.mark.slow) for seed in range(10)),
+    ],
+)
 def test_an_arm_that_brakes_ends_near_a_place_that_was_said_before(seed: int, ticks: int) -> None:
     """Two arms that are as wrong, towards each other, do not touch at the least stop."""
     of, random = load_profile("two_pandas_sim").of_part("left"), np.random.default_rng(seed)
