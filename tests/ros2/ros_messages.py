@@ -43,6 +43,11 @@ class String(IdlStruct, typename="std_msgs.msg.dds_.String_"):
 
 
 @dataclass
+class Empty(IdlStruct, typename="std_msgs.msg.dds_.Empty_"):
+    structure_needs_at_least_one_member: uint8 = 0
+
+
+@dataclass
 class Bool(IdlStruct, typename="std_msgs.msg.dds_.Bool_"):
     data: bool = False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -34,6 +35,10 @@ session: {{listen: ["{endpoint}"], connect: ["{endpoint}"]}}
 ros2: {{domain: {domain}}}
 """
 STAMP_NS = 1_700_000_000_123_456_789
+CAMERA = "/camera/realsense2_camera/color/image_raw"
+PICTURES = 60
+"""More than all buffers on their way take: 55 MB."""
+HEADER = ros.Header(ros.Time.of(STAMP_NS), "")
 
 
 @dataclass
@@ -113,6 +118,46 @@ def test_joint_states_of_a_dds_robot_are_read_to_the_bit(border: Border) -> None
     assert read.velocity is None
     assert read.effort.tolist() == position
     subscriber.undeclare()
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "message"),
+    [
+        ("/vla/stop", "std_msgs/msg/Empty", ros.Empty()),
+        ("/joint_states", "sensor_msgs/msg/JointState", ros.JointState(HEADER, [], [], [], [])),
+    ],
+)
+def test_what_is_sent_once_gets_past_pictures_that_nobody_takes_in_time(
+    border: Border, topic: str, kind: str, message: Any
+) -> None:
+    """What the bridge's queue has no place for is dropped."""
+    camera = Endpoint(EntityRole.SUBSCRIBER, CAMERA, "sensor_msgs/msg/Image", SENSOR)
+    endpoint, taken, go_on = Endpoint(EntityRole.SUBSCRIBER, topic, kind), [], threading.Event()
+    heard, subscriber = border.hear(endpoint)
+    slow = border.session.declare_subscriber(
+        border.wire.key(camera),
+        zenoh.handlers.Callback(lambda _: taken.append(go_on.wait()), indirect=False),
+    )
+    tokens = border.announce(camera) + border.announce(endpoint)
+    writer = border.node.publisher(topic, type(message))
+    pictures = border.node.publisher(CAMERA, ros.Image, reliable=False, depth=1)
+    until("the first", lambda: writer.write(message) or time.sleep(0.02) or heard, PATIENCE_S)
+    time.sleep(0.2)  # those that are on their way
+    before = len(heard)
+    picture = ros.Image(HEADER, 480, 640, "rgb8", 0, 1920, bytes(480 * 640 * 3))
+    try:
+        for _ in range(PICTURES):
+            pictures.write(picture)
+            time.sleep(0.02)
+        writer.write(message)
+        time.sleep(0.2)
+    finally:
+        go_on.set()
+    until("what was sent once", lambda: len(heard) > before, PATIENCE_S)
+    assert len(taken) < PICTURES
+    slow.undeclare()
+    subscriber.undeclare()
+    del tokens
 
 
 @pytest.mark.parametrize("kind", ["CartesianImpedanceGoal", "PoseStamped"])

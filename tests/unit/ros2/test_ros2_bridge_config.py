@@ -152,6 +152,16 @@ def test_a_name_is_meant_as_a_whole_and_to_the_letter(tmp_path: Path) -> None:
     assert not any(re.search(text, "/b/a/joint_states{x}") for text in expressions)
 
 
+def test_requests_go_before_states_and_these_before_images(tmp_path: Path) -> None:
+    profile = lab(tmp_path, "ros2: {finger_states: /fingers, wrench: {topic: /wrench}}\n")
+    section = bridge_config(profile)["plugins"]["ros2dds"]
+    ranks = dict(text.rsplit("=", 1) for text in section["pub_priorities"])
+    assert set(ranks) == set(section["allow"]["publishers"])
+    assert ranks["^/vla/stop$"] == ranks["^/vla/active$"] == "1:express"
+    assert ranks["^/joint_states$"] == ranks["^/fingers$"] == ranks["^/wrench$"] == "2"
+    assert ranks["^/camera/wrist_camera/color/image_raw$"] == "6"
+
+
 # -- where it is ----------------------------------------------------------------------------------
 def test_zenoh_reads_the_file_and_the_domain_is_the_profiles(tmp_path: Path) -> None:
     profile = lab(tmp_path, "ros2: {domain: 42, distribution: humble}\n")

@@ -19,6 +19,8 @@ from vla_zenoh.security.roles import EVERY_MESSAGE, IN, OUT, rule
 from vla_zenoh.security.store import AUTHORITY
 from vla_zenoh_ros2.keys import (
     ANSWER_TOPIC,
+    BOOL,
+    EMPTY,
     LOG,
     OPERATIONS,
     ROSOUT,
@@ -27,6 +29,7 @@ from vla_zenoh_ros2.keys import (
     Endpoint,
     EntityRole,
 )
+from vla_zenoh_ros2.pictures import COMPRESSED_IMAGE, IMAGE
 from vla_zenoh_ros2.readers import JOINT_STATE, WRENCH
 from vla_zenoh_ros2.transforms import TF, TF_MESSAGE, TF_STATIC
 from vla_zenoh_ros2.writers import DIAGNOSTICS, GRASP
@@ -43,12 +46,20 @@ ALLOWED_AS = {
 KINDS = (*ALLOWED_AS.values(), "action_clients")
 """All kinds in that list. One that is empty lets nothing through."""
 
+RANKS = {
+    **dict.fromkeys((EMPTY, BOOL, TEXT), "1:express"),
+    **dict.fromkeys((JOINT_STATE, WRENCH), "2"),
+    **dict.fromkeys((IMAGE, COMPRESSED_IMAGE), "6"),
+}
+"""Type -> Zenoh's number of a priority, as `vla_zenoh.bus.session` has for orders, states and
+images. Each has a queue of its own: in one with the images a stop would be dropped."""
+
 WIDTH = 80
 HEAD = """\
 // {program} for the profile {name}. Written by `vla-zenoh profile bridge-config`.
 // What the profile uses of the robot's ROS graph is let through, by its whole name, and nothing
 // else. What a listener does not take in time is dropped: the next joint state is on its way, and
-// a slow listener must not hold up the others.
+// a slow listener must not hold up the others. Requests go first, images last.
 """
 
 
@@ -94,6 +105,7 @@ def bridge_config(
             "ros2dds": {
                 "domain": ros2.domain,
                 "reliable_routes_blocking": False,
+                "pub_priorities": _ranked(profile),
                 "allow": _allowed(profile),
             }
         },
@@ -203,6 +215,13 @@ def _allowed(profile: Profile) -> dict[str, list[str]]:
     for end in endpoints(profile):
         out[ALLOWED_AS[end.role]].append(f"^{re.escape(end.name)}$")
     return {kind: sorted(set(names)) for kind, names in out.items()}
+
+
+def _ranked(profile: Profile) -> list[str]:
+    """Expressions of names, each with the Zenoh priority of what the bridge sends us of it."""
+    heard = (end for end in endpoints(profile) if end.role is EntityRole.SUBSCRIBER)
+    ranked = {f"^{re.escape(end.name)}$={RANKS[end.type]}" for end in heard if end.type in RANKS}
+    return sorted(ranked)
 
 
 def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
