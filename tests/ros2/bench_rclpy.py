@@ -42,6 +42,7 @@ from rclpy_rig import (
     heard,
     library,
     panda_dh,
+    publish,
     received_tcp,
     request,
     running_ros_lab,
@@ -58,6 +59,15 @@ MOVES = 3
 RESTART_S = 3.0
 ANSWER_S, EVERY_S = 20.0, 0.1
 """A stop is published at 10 Hz for so long at most."""
+NEW_PROGRAMS = (
+    ("once", 0.0, 1, 10),
+    ("once, 1 s after it made the publisher", 1.0, 1, 10),
+    ("20 times at 10 Hz", 0.0, 20, 10),
+    ("20 times at 10 Hz, depth 1", 0.0, 20, 1),
+)
+"""Words, how long it waits (s), how often, and the depth of the publisher's QoS."""
+HEARTBEAT_S = 4.0
+"""Fast DDS repeats what was not confirmed every 3 s."""
 PICTURE = (640, 480)
 
 
@@ -165,7 +175,7 @@ def stops(lab: RosLab, count: int) -> None:
         lab.move(FAST_M_S, FAST_HZ)
         speeds.append(lab.arm.speed_m_s())
         before = len(lab.person.told)
-        lab.person.ask("say", "said", topic="/vla/stop", type=EMPTY)
+        publish(lab.chain.session, lab.person, "/vla/stop", EMPTY)
         said_ns = lab.person.since(before, "said")[0]["t"]
         lab.arm.wait_still()
         track = lab.arm.track(said_ns)
@@ -177,6 +187,37 @@ def stops(lab: RosLab, count: int) -> None:
     say("| | p50 | p95 | n | most |\n|---|---|---|---|---|")
     say(f"| published → the arm stands, s | {p50_p95(took_s)} | {max(took_s):.3f} |")
     say(f"| way, mm | {p50_p95(1e3 * np.array(ways_m))} | {1e3 * max(ways_m):.1f} |")
+
+
+def first_stops(lab: RosLab, count: int) -> None:
+    """Of a ROS user's new program, which publishes as soon as it has a subscriber."""
+    arrived_ns: list[int] = []
+    subscriber = lab.chain.session.declare_subscriber(
+        "vla/stop", lambda sample: arrived_ns.append(time.monotonic_ns())
+    )
+    say("\n| a new program publishes a stop | lost | arrives after, s: p50 | p95 | n | most |")
+    say("|---|---|---|---|---|---|")
+    for words, wait_s, times, depth in NEW_PROGRAMS:
+        after_s = []
+        for _ in range(count):
+            person = Program("person", lab.distribution, lab.domain).start()
+            arrived_ns.clear()
+            stop = {"topic": "/vla/stop", "type": EMPTY, "qos_of": {"depth": depth}}
+            if wait_s:
+                person.ask("offer", "offers", **stop)
+                time.sleep(wait_s)
+            said_ns = person.ask("say", "said", **stop, count=times, rate_hz=10.0)["t"]
+            time.sleep(times / 10.0)
+            end_s = time.monotonic() + HEARTBEAT_S
+            while not arrived_ns and time.monotonic() < end_s:
+                time.sleep(0.01)
+            after_s += [(at_ns - said_ns) / 1e9 for at_ns in arrived_ns[:1]]
+            person.end()
+        lost, most_s = count - len(after_s), max(after_s, default=0.0)
+        say(f"| {words} | {lost} of {count} | {p50_p95(after_s)} | {most_s:.3f} |")
+    subscriber.undeclare()
+    lab.chain.until("stopped", lambda: lab.chain.state() == "stopped")
+    reset(lab)
 
 
 def move_at_last(lab: RosLab) -> None:
@@ -396,7 +437,8 @@ def returns(folder: Path, program: Path, distribution: str, count: int) -> None:
 
 
 # -------------------------------------------------------------------------------------------------
-SECTIONS = ("exactness", "latency", "stops", "restarts", "faults", "loss", "clock", "returns")
+IN_ONE_LAB = ("exactness", "latency", "stops", "first", "restarts", "faults")
+SECTIONS = (*IN_ONE_LAB, "loss", "clock", "returns")
 
 
 def main() -> None:
@@ -416,7 +458,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="bench-rclpy-") as name:
         folder = Path(name)
         size = PICTURE if "latency" in only else (160, 120)
-        if set(only) & set(SECTIONS[:5]):
+        if set(only) & set(IN_ONE_LAB):
             with running_ros_lab(folder, program, chosen.distribution, size=size) as lab:
                 lab.chain.activate_when_ready()
                 lab.settle()
@@ -426,6 +468,8 @@ def main() -> None:
                     latency(lab, chosen.seconds)
                 if "stops" in only:
                     stops(lab, chosen.stops)
+                if "first" in only:
+                    first_stops(lab, chosen.stops)
                 if "restarts" in only:
                     stops_while_the_bridge_restarts(lab, chosen.stops)
                 if "faults" in only:
