@@ -74,6 +74,7 @@ says ``ROBOT_PATIENCE_S = LONG_PATIENCE_S``."""
 LEASE_MS = 4000
 """A process that a busy computer does not run for a second is not to be given up by the router."""
 SETTLE_AGAIN_S = 2.0
+THERE_MM = 0.01
 
 
 def write_profile(
@@ -369,14 +370,7 @@ class Chain:
         start_m = self.reference_m()[2]
         prompt = f"HARD: go {direction} x{count}"
         self.client.set_prompt(prompt)
-
-        def done() -> bool:
-            status = self.client.status("command")  # one, as a newer one may come in between
-            said = status.detail if status else {}
-            ours = said.get("prompt") == prompt  # and not what was done before
-            return ours and said["policy_done"] and said["accepted_steps"] >= count
-
-        self.until(f"{count} steps carried out", done, timeout_s)
+        self.wait_done(prompt, count, timeout_s)
         self.wait_still()
         return float(self.reference_m()[2] - start_m)
 
@@ -443,6 +437,30 @@ class Chain:
             return since[-1] - since[0] > 0.25
 
         self.until("the arm stands", still, timeout_s)
+
+    def wait_done(self, prompt: str, steps: int = 0, timeout_s: float = PATIENCE_S) -> None:
+        """Until the policy says that it is done with a prompt, and its steps were accepted."""
+
+        def done() -> bool:
+            status = self.client.status("command")  # one, as a newer one may come in between
+            said = status.detail if status else {}
+            ours = said.get("prompt") == prompt  # and not what was done before
+            return ours and said["policy_done"] and said["accepted_steps"] >= steps
+
+        self.until(f"{prompt} carried out", done, timeout_s)
+
+    def wait_arrived(self) -> None:
+        """Until a perfect arm is where it is commanded to be, and that stands.
+
+        One that has not heard of its motion yet stands, too.
+        """
+
+        def arrived() -> bool:
+            status = self.client.status("command")
+            said = status.detail if status else {}
+            return bool(said["at_rest"]) and said["tracking_mm"] < THERE_MM
+
+        self.until("the arm arrives", arrived)
 
     def story(self) -> str:
         """What happened, for the message of a test that fails."""

@@ -27,11 +27,13 @@ from typing import Any
 import cv2
 import numpy as np
 import panda_dh
+import zenoh
 from bridge import ROOT, Bridge, generated
 from camera_rig import PATIENCE_S, free_endpoint, until
 from chain import CHAIN_PATIENCE_S, Chain, Track, running_chain
 from numpy.typing import NDArray
 from ros_node import free_domain
+from vla_zenoh_ros2.bridge_view import endpoints_key
 
 SIDE = Path(__file__).with_name("ros_side")
 ROS2_PAGE = ROOT / "docs" / "how-to" / "ros2.md"
@@ -296,15 +298,25 @@ class Arm(Program):
         way_m = np.linalg.norm(track.position_m[-1] - track.position_m[0])
         return float(way_m / (track.stamp_ns[-1] - track.stamp_ns[0]) * 1e9)
 
-    def stands(self) -> bool:
-        lines = self._lines("q", time.monotonic_ns() - int(STAND_S * 1e9))
-        if len(lines) < 5:
-            return False
-        return float(np.ptp([line["q"] for line in lines], axis=0).max()) < STILL_RAD
+    def stands(self, since_ns: int = 0) -> bool:
+        """Whether it stood for `STAND_S` until its newest joints, which are of `since_ns` or later.
+
+        On a busy computer these are few, and come late.
+        """
+        lines = []
+        for line in reversed(self.told):
+            if "q" not in line:
+                continue
+            lines.append(line)
+            if len(lines) >= 5 and line["t"] <= lines[0]["t"] - STAND_S * 1e9:
+                still = np.ptp([each["q"] for each in lines], axis=0).max() < STILL_RAD
+                return bool(still) and lines[0]["t"] >= since_ns
+        return False
 
     def wait_still(self, timeout_s: float = PATIENCE_S) -> FloatArray:
         """Until it stands; its TCP then, (4, 4)."""
-        until("the robot stands", self.stands, timeout_s)
+        now_ns = time.monotonic_ns()
+        until("the robot stands", lambda: self.stands(now_ns), timeout_s)
         return self.tcp()
 
 
@@ -525,6 +537,8 @@ def running_ros_lab(
 STRING, BOOL, EMPTY = "std_msgs/msg/String", "std_msgs/msg/Bool", "std_msgs/msg/Empty"
 TYPES = {"stop": EMPTY, "reset": EMPTY, "active": BOOL, "prompt": STRING, "request": STRING}
 ANSWER = "/vla/answer"
+GID_CHUNK = 6
+"""Of the key under which the bridge tells of an end."""
 STEPS_PATIENCE_S = 30.0
 
 
@@ -535,15 +549,8 @@ def carry_out(lab: RosLab, prompt: str, count: int) -> FloatArray:
     lab.arm.wait_still()
     words = f"HARD: {prompt} x{count}"
     client.set_prompt(words)
-
-    def done() -> bool:
-        status = client.status("command")
-        said = status.detail if status else {}
-        ours = said.get("prompt") == words
-        return ours and said["policy_done"] and said["accepted_steps"] >= count
-
-    lab.chain.until(f"{count} steps carried out", done, STEPS_PATIENCE_S)
-    lab.chain.wait_still()
+    lab.chain.wait_done(words, count, STEPS_PATIENCE_S)
+    lab.chain.wait_arrived()
     return lab.arm.wait_still()
 
 
@@ -571,12 +578,42 @@ def received_tcp(lab: RosLab) -> FloatArray:
     return panda_dh.forward([joints[name] for name in panda_dh.JOINTS])
 
 
+def wait_known(session: zenoh.Session, end: str, topic: str, ids: Sequence[str]) -> None:
+    """Until the bridge knows ends (`writer`, `reader`) of a topic by their ids in DDS.
+
+    What a publisher of Fast DDS sends before is lost, though it says that it has a subscriber: see
+    "The first message" in docs/how-to/ros2.md.
+    """
+    assert ids, f"ROS knows no {end} of {topic}"
+
+    def known() -> bool:
+        replies = session.get(endpoints_key(end, f"rt{topic}"), timeout=1.0)
+        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        return {*ids} <= {key.split("/")[GID_CHUNK] for key in keys}
+
+    until(f"the bridge knows each {end} of {topic}", known, 15.0)
+
+
+def publish(
+    session: zenoh.Session,
+    person: Program,
+    topic: str,
+    kind: str,
+    value: Mapping[str, Any] | None = None,
+    **how: Any,
+) -> None:
+    """Let a person publish when the bridge knows its publisher."""
+    offered = person.ask("offer", "offers", topic=topic, type=kind, qos_of=how.get("qos_of"))
+    wait_known(session, "writer", topic, offered["ids"])
+    person.ask("say", "said", topic=topic, type=kind, value=value or {}, **how)
+
+
 def hear_answers(lab: RosLab) -> None:
     """Let the person hear the answers to its requests."""
     person = lab.person
     if not any(line.get("hears") == ANSWER for line in person.told):
-        person.ask("hear", "hears", topic=ANSWER, type=STRING)
-        time.sleep(1.0)  # until the bridge has both ends of it
+        hears = person.ask("hear", "hears", topic=ANSWER, type=STRING)
+        wait_known(lab.chain.session, "reader", ANSWER, hears["ids"])
 
 
 def request(
@@ -586,7 +623,7 @@ def request(
     person = lab.person
     hear_answers(lab)
     before = len(person.told)
-    person.ask("say", "said", topic=f"/vla/{what}", type=TYPES[what], value=value or {}, **how)
+    publish(lab.chain.session, person, f"/vla/{what}", TYPES[what], value, **how)
 
     def answer() -> dict[str, Any] | None:
         found = (json.loads(line["value"]["data"]) for line in heard(person, ANSWER, before))

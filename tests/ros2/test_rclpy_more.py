@@ -30,6 +30,7 @@ from rclpy_rig import (
     heard,
     library,
     pictures,
+    publish,
     request,
     running_ros_lab,
     write_profile,
@@ -111,11 +112,9 @@ def test_two_robots_of_one_domain_move_each_by_its_own_topics(
             before = [arm.wait_still()[:3, 3] for arm in arms]
             text = json.dumps({"prompt": "HARD: go up x5", "active": True})
             topic = f"/robot{mine + 1}/vla/request"
-            person.ask("say", "said", topic=topic, type=STRING, value={"data": text})
-            done = until(
-                "five steps", lambda chain=chain: chain.detail("policy_done") or None, 20.0
-            )
-            assert done
+            publish(chains[0].session, person, topic, STRING, {"data": text})
+            chain.wait_done("HARD: go up x5", 5, 20.0)
+            chain.wait_arrived()
             after = [arm.wait_still()[:3, 3] for arm in arms]
             assert after[mine] - before[mine] == pytest.approx((0, 0, 5 * STEP_M), abs=EXACT_M)
             assert after[1 - mine] == pytest.approx(before[1 - mine], abs=STANDS_M)

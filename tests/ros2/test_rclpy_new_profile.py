@@ -111,6 +111,7 @@ def test_a_running_robot_becomes_a_profile_that_moves_it(
             chain.activate_when_ready()
             before_m = robot.arm.wait_still()[:3, 3]
             chain.client.set_prompt(f"HARD: go up x{STEPS}")
-            chain.until("it is done", lambda: chain.detail("policy_done"), MOVES_S)
+            chain.wait_done(f"HARD: go up x{STEPS}", STEPS, MOVES_S)
+            chain.wait_arrived()
             way_m = robot.arm.wait_still()[:3, 3] - before_m
         assert way_m == pytest.approx((0.0, 0.0, WAY_M), abs=EXACT_M)

@@ -162,9 +162,10 @@ def test_two_arms_of_one_robot_move_each_by_its_own_topics_and_stop_together(
         chain.activate_when_ready()
         before = {side: arm.joints_rad() for side, arm in arms.items()}
         chain.client.set_prompt("wave")
-        chain.until("it is done", lambda: chain.detail("policy_done"), MOVES_S)
+        chain.wait_done("wave", timeout_s=MOVES_S)
+        chain.wait_arrived()
         for side, sign in zip(SIDES, (1, -1), strict=True):
-            chain.until(f"{side} stands", arms[side].stands)
+            arms[side].wait_still()
             after = arms[side].joints_rad()
             wanted = before[side] + [sign * TURN_RAD, 0, 0, 0, 0, 0, 0]
             assert after == pytest.approx(wanted, abs=EXACT_RAD), chain.story()

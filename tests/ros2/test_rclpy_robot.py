@@ -5,6 +5,7 @@ The motion is judged by the joints that another rclpy node received, or by the r
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -22,7 +23,16 @@ from vla_zenoh.kinematics.kinematics import make_kinematics
 pytest.importorskip("ros_messages", exc_type=ImportError)
 
 import panda_dh
-from rclpy_rig import FRONT, carry_out, heard, received_tcp, request
+from rclpy_rig import (
+    EMPTY,
+    FRONT,
+    ROS2_PAGE,
+    Program,
+    carry_out,
+    heard,
+    received_tcp,
+    request,
+)
 
 if TYPE_CHECKING:
     from rclpy_rig import RosLab
@@ -121,12 +131,13 @@ def test_a_ros_user_sets_prompt_and_activation_and_is_answered(ros_lab: RosLab) 
     assert answer["ok"], answer
     answer = request(ros_lab, "prompt", {"data": "HARD: go up x5"})
     assert answer["ok"], answer
-    ros_lab.chain.until("five steps", lambda: ros_lab.chain.detail("policy_done"))
+    ros_lab.chain.wait_done("HARD: go up x5", 5)
+    ros_lab.chain.wait_arrived()
     way_m = ros_lab.arm.wait_still()[:3, 3] - began_m
     assert way_m == pytest.approx((0, 0, 5 * STEP_M), abs=EXACT_M)
     answer = request(ros_lab, "active", {"data": False})
     assert answer["ok"], answer
-    assert ros_lab.chain.state() == "inactive"
+    ros_lab.chain.until("inactive", lambda: ros_lab.chain.state() == "inactive")
 
 
 def test_a_ros_user_requests_everything_at_once(ros_lab: RosLab) -> None:
@@ -156,6 +167,24 @@ def test_a_ros_user_stops_the_moving_arm_and_resets_it(ros_lab: RosLab) -> None:
     assert refused["reason"]
     assert request(ros_lab, "reset")["ok"]
     ros_lab.chain.until("inactive", lambda: ros_lab.chain.state() == "inactive")
+
+
+def test_a_stop_of_a_new_program_arrives_if_it_is_published_as_the_page_says(
+    ros_lab: RosLab,
+) -> None:
+    """It publishes as soon as it has a subscriber: the first message may be lost."""
+    said = re.search(r"pub -r (\d+) -t (\d+) --qos-depth (\d+) /vla/stop", ROS2_PAGE.read_text())
+    assert said is not None
+    rate_hz, count, depth = map(int, said.groups())
+    how = {"count": count, "rate_hz": rate_hz, "qos_of": {"depth": depth}}
+    user = Program("person", ros_lab.distribution, ros_lab.domain).start()
+    try:
+        ros_lab.move()
+        user.ask("say", "said", topic="/vla/stop", type=EMPTY, **how)
+        ros_lab.chain.until("stopped", lambda: ros_lab.chain.state() == "stopped")
+    finally:
+        user.end()  # when it has published them all
+    assert request(ros_lab, "reset")["ok"]
 
 
 def test_what_is_received_once_more_does_not_activate(ros_lab: RosLab) -> None:

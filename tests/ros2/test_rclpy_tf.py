@@ -23,6 +23,7 @@ from rclpy_rig import (
     RosLab,
     depth_counts,
     heard,
+    publish,
     running_ros_lab,
 )
 from vla_zenoh_ros2.messages import Messages
@@ -158,7 +159,7 @@ def test_a_frame_that_another_node_begins_to_publish_is_left_to_it_and_nonsense_
 
     def say() -> None:
         text = messages.encode(message).hex()
-        lab.person.ask("say", "said", topic="/tf", type=TF_MESSAGE, bytes=text)
+        publish(lab.chain.session, lab.person, "/tf", TF_MESSAGE, bytes=text)
 
     say()
     why = lab.chain.until("it is left", lambda: tf(lab)["refused"].get("panda_link5"))

@@ -82,7 +82,8 @@ def test_a_dds_client_sets_prompt_and_activation(lab: Lab) -> None:
     lab.chain.until("active", lambda: lab.chain.state() == "active")
     said = set_prompt.call("HARD: go up x5", timeout_s=DDS_TIMEOUT_S)
     assert said.success, said.message
-    lab.chain.until("five steps", lambda: lab.chain.detail("policy_done"))
+    lab.chain.wait_done("HARD: go up x5", 5)
+    lab.chain.wait_still()
     ended_m = lab.witness.wait_still()
     assert ended_m[2] - began_m[2] == pytest.approx(5 * STEP_M, abs=WAY_TOLERANCE_M)
 

@@ -3,12 +3,14 @@
 Commands on stdin, one JSON object a line:
 
     {"do": "hear", "topic": "/vla/status", "type": "diagnostic_msgs/msg/DiagnosticArray", "qos": {}}
+    {"do": "offer", "topic": "/vla/prompt", "type": "std_msgs/msg/String"}
     {"do": "say", "topic": "/vla/prompt", "type": "std_msgs/msg/String", "value": {"data": "hold"}}
     {"do": "call", "service": "/vla/stop", "type": "std_srvs/srv/Trigger", "value": {}}
     {"do": "graph"}
 
 `say` waits until somebody listens, unless `wait_s` is 0; `bytes` (hex) instead of `value` is
-published as it is, as `ros2 bag play` does.
+published as it is, as `ros2 bag play` does. `offer` makes its publisher and publishes nothing; it
+and `hear` tell the ids in DDS of this node's ends of the topic.
 """
 
 from __future__ import annotations
@@ -23,9 +25,10 @@ from typing import Any
 import numpy as np
 import rclpy
 from qos import publishes, qos, subscribes
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from told import obey, tell
 
+NAME = "person"
 BIG = 256
 
 
@@ -58,7 +61,8 @@ class Person:
     """See the module."""
 
     def __init__(self) -> None:
-        self._node = rclpy.create_node("person")
+        self._node = rclpy.create_node(NAME)
+        self._executor = SingleThreadedExecutor()
         self._said: dict[Any, Any] = {}
         self._heard: list[Any] = []
 
@@ -81,7 +85,20 @@ class Person:
                 event_callbacks=subscribes(topic),
             )
         )
-        tell(hears=topic)
+        tell(hears=topic, ids=ids_of(self._node.get_subscriptions_info_by_topic(topic)))
+
+    def offer(self, topic: str, type: str, qos_of: Any = None) -> None:
+        """Be a publisher of a topic."""
+        self._publisher(topic, type, qos_of)
+        tell(offers=topic, ids=ids_of(self._node.get_publishers_info_by_topic(topic)))
+
+    def _publisher(self, topic: str, type: str, qos_of: Any) -> Any:
+        key = (topic, str(qos_of))
+        if key not in self._said:
+            self._said[key] = self._node.create_publisher(
+                type_of(type), topic, qos(**(qos_of or {})), event_callbacks=publishes(topic)
+            )
+        return self._said[key]
 
     def say(
         self,
@@ -96,12 +113,7 @@ class Person:
         stamped: bool = False,
     ) -> None:
         """Publish; `stamped`: each with the time in its header."""
-        key = (topic, str(qos_of))
-        if key not in self._said:
-            self._said[key] = self._node.create_publisher(
-                type_of(type), topic, qos(**(qos_of or {})), event_callbacks=publishes(topic)
-            )
-        publisher = self._said[key]
+        publisher = self._publisher(topic, type, qos_of)
         give_up_s = time.monotonic() + wait_s
         while not publisher.get_subscription_count() and time.monotonic() < give_up_s:
             time.sleep(0.005)
@@ -116,10 +128,15 @@ class Person:
             tell(said=topic, wall_ns=wall_ns, listeners=publisher.get_subscription_count())
 
     def unsay(self) -> None:
-        """Take every publisher back."""
-        for publisher in self._said.values():
-            self._node.destroy_publisher(publisher)
+        """Take every publisher back, where nothing waits for one at that moment."""
+        publishers = list(self._said.values())
         self._said.clear()
+
+        def take_back() -> None:
+            for publisher in publishers:
+                self._node.destroy_publisher(publisher)
+
+        self._executor.create_task(take_back)
 
     def call(self, service: str, type: str, value: Any = None, patience_s: float = 10.0) -> None:
         """Call a service."""
@@ -132,7 +149,7 @@ class Person:
             future.add_done_callback(lambda _: answered.set())
             answered.wait(patience_s)
         answer = plain(future.result()) if future is not None and future.done() else None
-        self._node.destroy_client(client)
+        self._executor.create_task(lambda: self._node.destroy_client(client))
         tell(called=service, found=found, answer=answer)
 
     def graph(self) -> None:
@@ -143,10 +160,14 @@ class Person:
 
     def spin(self) -> None:
         """Serve until ROS ends."""
-        executor = MultiThreadedExecutor(2)
-        executor.add_node(self._node)
+        self._executor.add_node(self._node)
         with contextlib.suppress(ExternalShutdownException):
-            executor.spin()
+            self._executor.spin()
+
+
+def ids_of(ends: Any) -> list[str]:
+    """Of this node's among the ends of a topic, in hexadecimal."""
+    return [bytes(end.endpoint_gid).hex() for end in ends if end.node_name == NAME]
 
 
 def bytes_of(text: str) -> bytes:
@@ -160,7 +181,7 @@ def main() -> None:
     person = Person()
     threading.Thread(target=person.spin).start()
     tell(ready=rclpy.get_rmw_implementation_identifier())
-    names = ("hear", "say", "unsay", "call", "graph")
+    names = ("hear", "offer", "say", "unsay", "call", "graph")
     obey({name: getattr(person, name) for name in names})
     rclpy.shutdown()
 
