@@ -49,7 +49,9 @@ for words, environment in json.load(sys.stdin):
     told.append((code, out.getvalue(), said.getvalue()))
 json.dump(told, sys.stdout)
 """
-AFTER = ((), ("--help",), ("a-word", "--an-option=1"))
+WAYS = ((), ("--help",), ("a-word", "--an-option=1"))
+FIRST, *OTHERS = plugins.PACKAGES
+COMMANDS = [*((FIRST, after) for after in WAYS), *((command, ("--help",)) for command in OTHERS)]
 LAB = """\
 extends: panda_sim
 hosts: {here: {nodes: [router, sim, camera, command, worker, primitives]}}
@@ -76,10 +78,9 @@ def said(alone: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dic
     folder = tmp_path_factory.mktemp("lab")
     (folder / "lab.yaml").write_text(LAB, "utf-8")
     asked = {line: (line.split(), {}) for line in LINES}
-    for command in plugins.PACKAGES:
-        for after in AFTER:
-            words = [*command.split("."), *after]
-            asked[" ".join(words)] = (words, {})
+    for command, after in COMMANDS:
+        words = [*command.split("."), *after]
+        asked[" ".join(words)] = (words, {})
     model = f"openpi={ROOT}/models/openpi/model.py"
     asked[PREPARED] = (["worker", "openpi"], {plugins.OWN_ENVIRONMENT_VARIABLE: model})
     done = subprocess.run(
@@ -156,15 +157,14 @@ def test_the_models_of_the_demo_need_no_package(alone: dict[str, str], name: str
 def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
     said: dict[str, Said],
 ) -> None:
-    for command, package in plugins.PACKAGES.items():
-        for after in AFTER:
-            line = " ".join([*command.split("."), *after])
-            code, _, told = said[line]
-            assert code == 1, (line, told)
-            assert f"needs the package {package}; install it with: pip install" in told, line
-            folders = [*plugins.needed_by(package), package]
-            paths = " ".join(f"'./plugins/{each}'" for each in folders)
-            assert f" . {paths} in a checkout" in told, line
+    for command, after in COMMANDS:
+        line, package = " ".join([*command.split("."), *after]), plugins.PACKAGES[command]
+        code, _, told = said[line]
+        assert code == 1, (line, told)
+        assert f"needs the package {package}; install it with: pip install" in told, line
+        folders = [*plugins.needed_by(package), package]
+        paths = " ".join(f"'./plugins/{each}'" for each in folders)
+        assert f" . {paths} in a checkout" in told, line
 
 
 def test_up_says_at_its_start_that_a_node_of_its_host_needs_a_package(

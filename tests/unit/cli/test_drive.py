@@ -116,25 +116,6 @@ def test_with_json_the_lines_of_a_command_are_its_messages(
     }
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("line", ["profile show panda_sim --json", "--help"])
-def test_output_that_is_read_no_further_is_no_traceback(line: str, unbuffered: str) -> None:
-    """As by `| head`."""
-    read, write = os.pipe()
-    os.close(read)
-    done = subprocess.run(
-        [sys.executable, "-m", "vla_zenoh", *line.split()],
-        stdout=write,
-        stderr=subprocess.PIPE,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
-        timeout=60,
-    )
-    os.close(write)
-    assert (done.returncode, done.stderr) == (1, "")
-
-
 class Stop(NamedTuple):
     """What `vla-zenoh stop` printed, with its status, and when its first line came."""
 

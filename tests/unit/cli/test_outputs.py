@@ -39,7 +39,7 @@ def closed() -> Iterator[None]:
 OUTPUTS = {"full disk": full_disk, "no reader": no_reader, "closed": closed}
 
 
-def start(output: str, *words: str) -> subprocess.Popen[str]:
+def start(output: str, *words: str, unbuffered: str = "") -> subprocess.Popen[str]:
     """``vla-zenoh`` whose stdout is such an output, and whose stderr is read."""
     close = (lambda: os.close(1)) if output == "closed" else None
     with OUTPUTS[output]() as number:
@@ -49,6 +49,7 @@ def start(output: str, *words: str) -> subprocess.Popen[str]:
             stderr=subprocess.PIPE,
             text=True,
             preexec_fn=close,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
         )
 
 
@@ -68,7 +69,15 @@ def test_a_stop_goes_on_whatever_becomes_of_its_output() -> None:
 @pytest.mark.parametrize("output", OUTPUTS)
 @pytest.mark.parametrize("words", ["--version", "--help", "profile show panda_sim"])
 def test_other_commands_say_it_in_one_line_at_most(output: str, words: str) -> None:
-    process = start(output, *words.split())
+    check_end(start(output, *words.split()), output)
+
+
+def test_a_reader_that_leaves_is_no_traceback_where_nothing_is_buffered() -> None:
+    check_end(start("no reader", "profile", "show", "panda_sim", "--json", unbuffered="1"), "")
+
+
+def check_end(process: subprocess.Popen[str], output: str) -> None:
+    """It ended with the status and the sentence for such an output."""
     _, said = process.communicate(timeout=20)
     assert process.returncode == (output != "closed")
     full = "error: the output cannot be written: No space left on device\n"
