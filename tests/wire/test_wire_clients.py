@@ -30,6 +30,7 @@ PROMPT = "put the red brick in the box"
 TASK_S = 40.0
 
 
+@pytest.mark.long
 def test_operator_and_worker_in_plain_python_put_the_brick_in_the_box(tmp_path: Path) -> None:
     more = (
         "cameras: {front: null, wrist: null}\n"
