@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import typer
 from rich.progress import track
+from rich.table import Table
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, options
 from vla_zenoh.cli.output import errors, new_table
@@ -45,8 +47,15 @@ def command(
         stop = stop_on_signals()
         die_with_parent()
         loaded = own_address(chosen)
-        for rate_hz in track(rates_hz, "command node", console=errors()):
-            rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
+        try:
+            for rate_hz in track(rates_hz, "command node", console=errors()):
+                rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
+        finally:
+            if rows:
+                result.show(rows, _table(rows))
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     times = [f"{name} {share}" for name in ("tick us", "late us", "pose ms") for share in SHARES]
     columns = ("set Hz", "held Hz", "missed", "bare loop", "core share", *times)
     table = new_table(*columns, left=())
@@ -67,4 +76,4 @@ def command(
     )
     realtime = all(row["realtime"] for row in rows)
     table.caption = text if realtime else f"{text} (no real-time priority here)"
-    result.show(rows, table)
+    return table
