@@ -73,7 +73,7 @@ def rest(
 
     stop = stop_on_signals()
     die_with_parent()
-    with kept_rows(output) as rows:
+    with kept_rows(output, _tables) as rows:
         for _ in range(rounds):
             row, sent = measure_ours(seconds, stop, rows)
             rows.append({"way": OURS, "seconds": seconds, **row, "sent": sent})
@@ -83,13 +83,16 @@ def rest(
         pictures.mkdir(parents=True, exist_ok=True)
         for kind in KINDS:
             write(draw(rows), pictures / f"rest.{kind}")
+
+
+def _tables(rows: Rows) -> list[Table]:
     table = Table("way", *NAMES, "all", "user", "system", title="Percent of a core")
     for row in rows:
         shares = row["percent"]
         user, system = (sum(each[i] for each in shares.values()) for i in (0, 1))
         cells = [f"{sum(shares[name]):.1f}" for name in NAMES]
         table.add_row(row["way"], *cells, f"{user + system:.1f}", f"{user:.1f}", f"{system:.1f}")
-    output.show(rows, table)
+    return [table]
 
 
 def bench_profile(folder: Path) -> Profile:

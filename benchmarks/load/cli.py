@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
@@ -58,7 +59,7 @@ def load(
     declared = None
     if model_ms is not None:
         declared = {"cost_ms": f"{model_ms:g}", "growth": f"{growth:g}"}
-    with kept_rows(output) as rows:
+    with kept_rows(output, _tables) as rows:
         for counts, make in ((robot_counts, "robots"), (camera_counts, "cameras")):
             if not counts:
                 continue
@@ -66,15 +67,6 @@ def load(
                 for row in getattr(running, make)(counts, seconds):
                     rows.append(row)
                     errors().print(f"{row[make]} {make} measured", style="dim")
-    tables: list[Table] = []
-    for title, kind, columns in (
-        ("Robots", "robots", ROBOT_COLUMNS),
-        ("Cameras of 640x480 at 30 Hz, raw", "cameras", CAMERA_COLUMNS),
-    ):
-        chosen = [row for row in rows if row[kind]]
-        if chosen:
-            tables.append(_table(title, kind, columns, chosen))
-    output.show(rows, *tables)
 
 
 ROBOT_COLUMNS = {
@@ -93,6 +85,16 @@ CAMERA_COLUMNS = {
     "latency_p50_ms": "ms p50",
     "latency_p95_ms": "ms p95",
 }
+
+
+def _tables(rows: list[dict[str, Any]]) -> Iterator[Table]:
+    for title, kind, columns in (
+        ("Robots", "robots", ROBOT_COLUMNS),
+        ("Cameras of 640x480 at 30 Hz, raw", "cameras", CAMERA_COLUMNS),
+    ):
+        chosen = [row for row in rows if row[kind]]
+        if chosen:
+            yield _table(title, kind, columns, chosen)
 
 
 def _table(title: str, kind: str, columns: dict[str, str], rows: list[dict[str, Any]]) -> Table:

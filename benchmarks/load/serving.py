@@ -457,7 +457,8 @@ def serving(
     if earlier:
         rows = [row for file in earlier for row in json.loads(file.read_text("utf-8"))]
         compare(rows)
-        _show(output, rows, pictures)
+        output.show(rows, *_tables(rows))
+        _draw(rows, pictures)
         return
     counts = sorted({int(count) for count in number_list("--robots", robots, 1, MOST)})
     costs = number_list("--model-ms", model_ms, 1, 10_000)
@@ -468,7 +469,7 @@ def serving(
     shares = number_list("--growth", growth, 0, 1)
     stop = stop_on_signals()
     die_with_parent()
-    with kept_rows(output) as rows:
+    with kept_rows(output, _tables) as rows:
         for cost_ms, count_of_cameras, (way, share) in product(
             costs, numbers, _ways(chosen, shares)
         ):
@@ -489,7 +490,12 @@ def serving(
                     errors().print(f"the processors are full, most of it {full}")
                     break
         compare(rows)
-    _show(output, rows, pictures)
+    _draw(rows, pictures)
+
+
+def _draw(rows: list[dict[str, Any]], pictures: Path | None) -> None:
+    for file in write_figures(pictures, rows) if pictures is not None else ():
+        errors().print(str(file), style="dim")
 
 
 def _ways(chosen: Sequence[str], shares: Sequence[float]) -> Iterable[tuple[str, float | None]]:
@@ -518,9 +524,7 @@ def _served(row: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(row[name] for name in ("robots", "model_ms", "cameras", "side"))
 
 
-def _show(output: ResultOptions, rows: list[dict[str, Any]], pictures: Path | None) -> None:
-    for file in write_figures(pictures, rows) if pictures is not None else ():
-        errors().print(str(file), style="dim")
+def _tables(rows: list[dict[str, Any]]) -> list[Table]:
     order = list(LABELS)
     table = Table(box=SIMPLE, pad_edge=False)
     for column in (
@@ -556,4 +560,4 @@ def _show(output: ResultOptions, rows: list[dict[str, Any]], pictures: Path | No
             f"{row['to_worker_kb_s']:.0f}" if row["jpeg"] and "to_worker_kb_s" in row else "",
             f"{row['busy_cores']:g} of {row['host_cores']}",
         )
-    output.show(rows, table)
+    return [table]

@@ -43,19 +43,15 @@ def command(
     rates_hz = number_list("--rates", rates, 50, 1000)
     chosen = effective_profile(profile)
     chosen.require_one_arm("the motion of bench command")
-    with kept_rows(result) as rows:
+    with kept_rows(result, _tables) as rows:
         stop = stop_on_signals()
         die_with_parent()
         loaded = own_address(chosen)
-        try:
-            for rate_hz in track(rates_hz, "command node", console=errors()):
-                rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
-        finally:
-            if rows:
-                result.show(rows, _table(rows))
+        for rate_hz in track(rates_hz, "command node", console=errors()):
+            rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
 
 
-def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
+def _tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     times = [f"{name} {share}" for name in ("tick us", "late us", "pose ms") for share in SHARES]
     columns = ("set Hz", "held Hz", "missed", "bare loop", "core share", *times)
     table = new_table(*columns, left=())
@@ -76,4 +72,4 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     )
     realtime = all(row["realtime"] for row in rows)
     table.caption = text if realtime else f"{text} (no real-time priority here)"
-    return table
+    return [table]

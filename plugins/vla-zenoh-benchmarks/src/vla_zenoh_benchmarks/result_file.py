@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,8 +72,15 @@ class Rows(list[dict[str, Any]]):
 
 
 @contextmanager
-def kept_rows(options: ResultOptions) -> Iterator[Rows]:
-    """Rows that are written even after a failure, which shows the last log lines.
+def kept_rows(
+    options: ResultOptions, tables: Callable[[Rows], Iterable[RenderableType]]
+) -> Iterator[Rows]:
+    """Rows that are written and shown, those before a failure or Ctrl-C, too.
+
+    A failure shows the last log lines as well.
+
+    Args:
+        tables: of the rows, for a person.
 
     Raises:
         typer.Exit: Ctrl-C.
@@ -92,3 +99,4 @@ def kept_rows(options: ResultOptions) -> Iterator[Rows]:
         finally:
             if rows:
                 write_json(file, rows)
+                options.show(rows, *tables(rows))
