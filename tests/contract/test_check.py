@@ -31,7 +31,8 @@ from vla_zenoh.profile import JointLimits, Limits, load_profile, override
 
 ROOT = Path(__file__).parents[2]
 BROKEN = Path(__file__).with_name("broken_worker.py")
-RUNS = 40
+RUNS, PASSING_RUNS, FEW_RUNS = 40, 20, 3
+"""Enough to see what memory does, and where that does not matter."""
 PATIENCE_S = 5.0
 
 ERRORS = {
@@ -78,7 +79,7 @@ def examined(fault: str, *, against: str | None = None, **more: Any) -> CheckRep
         "broken",
         ModelRunner(more.pop("patience_s", PATIENCE_S)),
         profile=load_profile(against) if against else None,
-        runs=RUNS,
+        runs=RUNS if fault in ("", "grows") else FEW_RUNS,
         **more,
     ).run()
 
@@ -129,7 +130,9 @@ class SlowToLoad(ModelRunner):
 
 def test_the_time_to_load_is_not_taken_from_that_to_examine() -> None:
     policy = make_policy(find_model(str(BROKEN)), {"fault": ""})
-    report = Examination(policy, "broken", SlowToLoad(PATIENCE_S), runs=RUNS, budget_s=30.0).run()
+    report = Examination(
+        policy, "broken", SlowToLoad(PATIENCE_S), runs=FEW_RUNS, budget_s=30.0
+    ).run()
     assert "cut_short" not in names(report, "note")
     assert report.depends_on["pictures"]
 
@@ -198,10 +201,10 @@ def passes(model: str, **options: str) -> CheckReport:
         model,
         ModelRunner(PATIENCE_S),
         profile=load_profile("panda_sim"),
-        runs=RUNS,
+        runs=PASSING_RUNS,
     ).run()
     assert report.ok, report.findings
-    assert report.runs >= RUNS
+    assert report.growth_kib_per_run is not None
     return report
 
 
@@ -426,26 +429,26 @@ def test_the_chart_differs_from_all_its_mirror_images_and_channel_orders() -> No
 # -- the command ----------------------------------------------------------------------------------
 
 
-def test_the_command_prints_json_and_fails_with_1() -> None:
-    words = ("check", str(BROKEN), "--set", "fault=millimetres", "--runs", "3", "--json")
+def test_the_command_passes_a_good_one() -> None:
+    done = command_line("check", str(BROKEN), "--profile", "panda_sim", "--runs", "3")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "keeps its contract, 0 warnings" in done.stdout
+
+
+def test_the_command_prints_json_and_fails_with_1_for_a_warning_where_it_is_strict() -> None:
+    words = ("check", str(BROKEN), "--set", "fault=deaf", "--runs", "3", "--strict", "--json")
     done = command_line(*words)
     assert done.returncode == 1, done.stderr
     said = json.loads(done.stdout)
-    assert said["ok"] is False
-    assert [finding["name"] for finding in said["findings"]] == ["position_units"]
+    assert said["ok"] is True
+    assert [finding["name"] for finding in said["findings"]] == ["ignores_prompt"]
 
 
-def test_the_command_passes_a_good_one_and_a_warning_only_when_it_is_not_strict() -> None:
-    done = command_line("check", str(BROKEN), "--profile", "panda_sim", "--runs", "12")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "keeps its contract, 0 warnings" in done.stdout
-    deaf = ("check", str(BROKEN), "--set", "fault=deaf", "--runs", "3", "--strict")
-    assert command_line(*deaf).returncode == 1
-
-
-def test_a_file_that_is_no_model_is_named() -> None:
+def test_a_file_that_is_no_model_is_named_and_fails_with_1() -> None:
     done = command_line("check", "replay", "--json")
     assert done.returncode == 1
-    (finding,) = json.loads(done.stdout)["findings"]
+    said = json.loads(done.stdout)
+    assert said["ok"] is False
+    (finding,) = said["findings"]
     assert finding["name"] == "cannot_be_made"
     assert "Its options: file" in finding["why"]
