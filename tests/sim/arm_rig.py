@@ -133,7 +133,7 @@ def begin(
     return loop
 
 
-def moving(seconds: float = 1.2, prompt: str = UP, rate_hz: float = RATE_HZ) -> Lockstep:
+def moving(seconds: float = 1.0, prompt: str = UP, rate_hz: float = RATE_HZ) -> Lockstep:
     """A loop whose arm is in full motion."""
     loop = begin(prompt, rate_hz)
     loop.run(seconds)
@@ -201,7 +201,7 @@ def check_stop(loop: Lockstep, since: int, within: tuple[float, float]) -> None:
 def goes_on(loop: Lockstep) -> None:
     """Activated again it moves from where it is, without a jump."""
     activate(loop)
-    loop.run(0.6)
+    loop.run(0.4)
     assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
 
 

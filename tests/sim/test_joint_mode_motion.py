@@ -30,7 +30,7 @@ def begin(prompt: str, posture: str = "start") -> Lockstep:
     loop = Lockstep(here, world, Asked(), reach=ReachabilityFilter(here))
     loop.put("rate", 10.0)
     loop.put("prompt", prompt)
-    loop.run(1.1)
+    loop.run(0.3)
     activate(loop)
     return loop
 
@@ -41,7 +41,7 @@ def test_an_elbow_moves_by_itself_only_where_the_profile_asks_for_it(
 ) -> None:
     loop = begin("0 0 0", posture)
     before_rad = loop.world.joint_state().position_rad
-    loop.run(1.5)
+    loop.run(0.8)
     moved_rad = np.abs(loop.world.joint_state().position_rad - before_rad).max()
     assert loop.commander.state.value == "active"
     assert (moved_rad > 0.1) == moves
@@ -50,7 +50,7 @@ def test_an_elbow_moves_by_itself_only_where_the_profile_asks_for_it(
 
 def test_measured_joints_that_are_not_where_they_are_commanded_stop_the_arm() -> None:
     loop = begin("0 0 0.01")
-    loop.run(1.0)
+    loop.run(0.5)
     assert speed_m_s(loop)[-1] > 0.03
     assert loop.commander.parts[0].elbow_rad < 0.05
 
@@ -62,7 +62,7 @@ def test_measured_joints_that_are_not_where_they_are_commanded_stop_the_arm() ->
 
     loop.tamper = astray
     since = mark(loop)
-    loop.run(1.0)
+    loop.run(0.5)
     assert loop.commander.state.value == "inactive"
     told = next(event for event in loop.events if event.what == "elbow_rad")
     assert told.why == "braked at panda_joint3"

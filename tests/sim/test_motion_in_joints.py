@@ -72,6 +72,7 @@ WORKER = "worker-scripted"
 STATES = (PoseState, GripperState, JointState)
 LIMIT_RTOL, JERK_RTOL = 1e-6, 1e-3
 EXACT_M = 1e-3
+WATCHED_S = 0.6
 PUSH_N, LASTING_N = 150.0, 5.0
 
 
@@ -116,7 +117,7 @@ def begin(prompt: str) -> Lockstep:
     loop = Lockstep(PROFILE, world(), Upward(), reach=shadow())
     loop.put("rate", RATE_HZ)
     loop.put("prompt", prompt)
-    loop.run(1.1)
+    loop.run(0.3)
     activate(loop)
     return loop
 
@@ -223,7 +224,7 @@ def test_a_fault_in_a_motion_of_joints_stops_the_arm(fault: str) -> None:
     loop = moving()
     since = mark(loop)
     happen(loop)
-    loop.run(1.2)
+    loop.run(WATCHED_S)
     # After a prompt it waits for a chunk for longer than the arm needs to stop.
     assert loop.commander.state.value != "active" or loop.refused["step_rad"] > 5
     check_stop(loop, since, within)

@@ -7,17 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from arm_rig import (
     BRAKE,
     HOLD,
-    LIMIT_RTOL,
     LOST,
     OWN,
-    RATE_HZ,
     SILENT,
     SPEED_M_S,
     STARTED_S,
@@ -26,7 +23,6 @@ from arm_rig import (
     STILL_M_S,
     UP,
     Asked,
-    activate,
     after,
     begin,
     changed,
@@ -35,6 +31,7 @@ from arm_rig import (
     chunks_only,
     delayed,
     early,
+    goes_on,
     later,
     mark,
     moving,
@@ -58,13 +55,14 @@ from vla_zenoh.types import (
 )
 
 EXACT_M = 1e-3
+AFTER_S = 0.5
 WORKER = "worker-scripted"
 
 
 def settled_height_m(loop: Lockstep) -> float:
     """Where it stands when nothing more is asked."""
     loop.put("prompt", HOLD)
-    loop.run(1.2)
+    loop.run(0.8)
     assert speed_m_s(loop)[-1] < STILL_M_S
     return float(path_m(loop)[-1, 2])
 
@@ -74,7 +72,7 @@ def test_late_chunks_cost_time_and_no_way() -> None:
     start_m, steps = path_m(loop)[0, 2], loop.commander.progress.steps
     assert steps >= 5
     loop.tamper = delayed(0.2, ActionChunk)
-    loop.run(1.0)
+    loop.run(0.6)
     steps = loop.commander.progress.steps  # a new prompt counts anew
     loop.tamper = None
     assert settled_height_m(loop) - start_m == pytest.approx(STEP_M * steps, abs=EXACT_M)
@@ -91,14 +89,11 @@ def test_chunks_that_are_too_late_are_nothing_and_the_arm_stops() -> None:
     check_motion(loop)
 
 
-@pytest.mark.parametrize("kept", [Image, None])
-def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm(
-    kept: type[Any] | None,
-) -> None:
+def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm() -> None:
     first: dict[str, Message] = {}
 
     def repeated(sent: Message) -> Iterable[Message]:
-        if sent.kind is not kept:
+        if sent.kind is not Image:
             return [sent]
         shown = first.setdefault(sent.camera, sent)
         return [replace(sent, payload=shown.payload)]
@@ -106,11 +101,7 @@ def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm(
     loop = moving()
     loop.tamper = repeated
     loop.run(2.0)
-    found = [event for event in loop.events if event.what == "same_image"]
-    if kept is None:  # images go through `tamper` and differ
-        assert not found
-        return
-    (event,) = found
+    (event,) = [event for event in loop.events if event.what == "same_image"]
     assert "while the arm moves" in event.why
     assert speed_m_s(loop)[-1] < STILL_M_S
     check_motion(loop)
@@ -120,22 +111,19 @@ def test_chunks_from_the_future_are_nothing_and_the_arm_stops() -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = early
-    loop.run(1.0)
+    loop.run(0.7)
     assert loop.refused["future"] > 5
     check_stop(loop, since, STARVED)
     check_motion(loop)
 
 
-def test_duplicates_move_nothing() -> None:
-    kinds = (ActionChunk, PoseCommand, PoseState, GripperState)
-    twice = after(1.0, lambda sent: [sent, sent] if sent.kind in kinds else [sent])
-    np.testing.assert_array_equal(twice, undisturbed(1.0))
+def test_duplicates_at_once_and_much_later_move_nothing() -> None:
+    def again(sent: Message) -> Iterable[Message]:
+        if sent.kind in (ActionChunk, PoseCommand):
+            return [sent, sent, later(sent, 0.15)]
+        return [sent, sent] if sent.kind in (PoseState, GripperState) else [sent]
 
-
-def test_duplicates_that_come_much_later_move_nothing() -> None:
-    kinds = (ActionChunk, PoseCommand)
-    echo = after(1.0, lambda sent: [sent, later(sent, 0.15)] if sent.kind in kinds else [sent])
-    np.testing.assert_array_equal(echo, undisturbed(1.0))
+    np.testing.assert_array_equal(after(AFTER_S, again), undisturbed(AFTER_S))
 
 
 def test_a_chunk_that_is_overtaken_is_left_out_and_nothing_jumps() -> None:
@@ -144,7 +132,7 @@ def test_a_chunk_that_is_overtaken_is_left_out_and_nothing_jumps() -> None:
     loop.tamper = chunks_only(
         lambda sent: [later(sent, 0.25) if sent.header.seq % 4 == 0 else sent]
     )
-    loop.run(1.2)
+    loop.run(1.0)
     steps = loop.commander.progress.steps
     loop.tamper = None
     assert loop.refused["replayed"] >= 2
@@ -155,42 +143,49 @@ def test_a_chunk_that_is_overtaken_is_left_out_and_nothing_jumps() -> None:
 
 def test_commands_in_disorder_do_not_shake_the_arm() -> None:
     mixed = after(
-        1.0,
+        AFTER_S,
         lambda sent: [
             later(sent, 0.006) if sent.kind is PoseCommand and sent.header.seq % 3 == 0 else sent
         ],
     )
-    assert np.abs(mixed - undisturbed(1.0)).max() < EXACT_M
+    assert np.abs(mixed - undisturbed(AFTER_S)).max() < EXACT_M
 
 
 def test_a_heap_of_chunks_after_a_pause_is_not_made_up_for() -> None:
     loop = moving()
     since = mark(loop)
-    free_ns = loop.now_ns + 1_500_000_000
+    free_ns = loop.now_ns + 1_000_000_000
     loop.tamper = chunks_only(
         lambda sent: [replace(sent, arrival_ns=max(sent.arrival_ns, free_ns))]
     )
-    loop.run(1.45)
+    loop.run(0.95)
     check_stop(loop, since, STARVED)
     waiting = mark(loop)
     loop.run(0.35)
-    # Ten chunks lay there, fresh enough, made by a model that saw an arm that stood.
+    # Chunks lay there, fresh enough, made by a model that saw an arm that stood.
     assert way_m(loop, waiting) < 0.35 * SPEED_M_S + STEP_M
     assert speed_m_s(loop)[waiting:].max() < 1.5 * SPEED_M_S
-    loop.run(0.5)
+    loop.run(0.2)
     assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
     check_motion(loop)
 
 
-@pytest.mark.parametrize("step_s", [2.0, -2.0])
-@pytest.mark.parametrize("node", [CAMERA, WORKER])
+@pytest.mark.parametrize(
+    ("node", "step_s"),
+    [
+        (CAMERA, 2.0),
+        (WORKER, -2.0),
+        pytest.param(CAMERA, -2.0, marks=pytest.mark.long),
+        pytest.param(WORKER, 2.0, marks=pytest.mark.long),
+    ],
+)
 def test_a_clock_of_camera_or_worker_that_jumps_stops_the_arm_until_it_is_right(
     node: str, step_s: float
 ) -> None:
     loop = moving()
     since = mark(loop)
     loop.set_clock(node, step_s)
-    loop.run(0.6)
+    loop.run(0.45)
     check_stop(loop, since, STARVED)
     loop.set_clock(node, 0.0)
     loop.run(0.5)
@@ -198,21 +193,19 @@ def test_a_clock_of_camera_or_worker_that_jumps_stops_the_arm_until_it_is_right(
     check_motion(loop)
 
 
-@pytest.mark.parametrize("step_s", [2.0, -2.0])
+@pytest.mark.parametrize("step_s", [2.0, pytest.param(-2.0, marks=pytest.mark.long)])
 def test_a_clock_of_the_command_node_that_jumps_stops_the_arm(step_s: float) -> None:
     loop = moving()
     since = mark(loop)
     loop.set_clock(COMMAND, step_s)
-    loop.run(0.6)
+    loop.run(0.4)
     check_stop(loop, since, BRAKE)
     loop.put("active", True)
     loop.run(0.2)  # its clock differs from the others', so it is not given the arm
     loop.set_clock(COMMAND, 0.0)
     loop.run(0.2)
     assert way_m(loop, since) < BRAKE[1]
-    activate(loop)
-    loop.run(0.5)
-    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    goes_on(loop)
     check_motion(loop)
 
 
@@ -226,23 +219,21 @@ def test_a_clock_of_the_robot_that_jumps_stops_the_arm(
     loop = moving()
     since = mark(loop)
     loop.set_clock(SIM, step_s)
-    loop.run(0.6)
+    loop.run(0.4)
     check_stop(loop, since, within)
     loop.set_clock(SIM, 0.0)
-    loop.run(0.3)
+    loop.run(0.2)
     assert way_m(loop, since) < within[1]
-    activate(loop)
-    loop.run(0.5)
-    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    goes_on(loop)
     check_motion(loop, own_brake=step_s > 0)
 
 
 def test_a_second_worker_moves_nothing_while_the_first_has_the_arm() -> None:
     loop = begin(UP, others={"other": Asked("other", horizon=8)})
-    for duration_s in (STARTED_S, 1.0):
+    for duration_s in (STARTED_S, AFTER_S):
         loop.run(duration_s)
     check_motion(loop)
-    np.testing.assert_array_equal(path_m(loop), undisturbed(1.0))
+    np.testing.assert_array_equal(path_m(loop), undisturbed(AFTER_S))
 
 
 def test_a_second_process_under_the_name_of_the_worker_moves_nothing() -> None:
@@ -251,7 +242,7 @@ def test_a_second_process_under_the_name_of_the_worker_moves_nothing() -> None:
         steps = -np.array(message.unpack(sent.payload)["steps"])
         return [sent, replace(with_fields(sent, steps=steps), header=header)]
 
-    np.testing.assert_array_equal(after(1.0, chunks_only(forge)), undisturbed(1.0))
+    np.testing.assert_array_equal(after(AFTER_S, chunks_only(forge)), undisturbed(AFTER_S))
 
 
 # -- NaN, infinity, quaternions -------------------------------------------------------------------
@@ -261,9 +252,9 @@ NO_ROTATION = {"quat_xyzw": np.array([0.9, 0.0, 0.0, 0.0])}
 @pytest.mark.parametrize(
     ("kind", "tamper", "within"),
     [
-        (ActionChunk, spoilt(ActionChunk, "steps"), STARVED),
+        pytest.param(ActionChunk, spoilt(ActionChunk, "steps"), STARVED, marks=pytest.mark.long),
         (PoseState, spoilt(PoseState, "position_m"), LOST),
-        (GripperState, spoilt(GripperState, "width_m"), LOST),
+        pytest.param(GripperState, spoilt(GripperState, "width_m"), LOST, marks=pytest.mark.long),
         (PoseCommand, changed(PoseCommand, **NO_ROTATION), SILENT),
     ],
 )
@@ -273,14 +264,12 @@ def test_numbers_that_are_none_or_no_rotation_stop_the_arm(
     loop = moving()
     since = mark(loop)
     loop.tamper = tamper
-    loop.run(0.7)
+    loop.run(0.5)
     assert loop.refused["invalid"] > 0
     check_stop(loop, since, within)
     check_motion(loop, own_brake=kind is PoseCommand)
 
 
 def test_the_undisturbed_arm_keeps_the_speed_that_is_asked_for() -> None:
-    loop = moving(1.5)
-    assert np.abs(np.diff(path_m(loop)[-25:, 2]) * 250 - SPEED_M_S).max() < 0.1 * SPEED_M_S
-    assert loop.commander.task.rate_hz == pytest.approx(RATE_HZ, rel=LIMIT_RTOL)
-    check_motion(loop)
+    speed_m_s = np.diff(undisturbed(AFTER_S)[-25:, 2]) * 250
+    assert np.abs(speed_m_s - SPEED_M_S).max() < 0.1 * SPEED_M_S

@@ -23,6 +23,7 @@ from arm_rig import (
     check_motion,
     check_stop,
     dropped,
+    goes_on,
     mark,
     moving,
     path_m,
@@ -37,9 +38,9 @@ from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseReferen
 
 EXACT_M = 1e-3
 SLIP_M = 1e-3
-TOGGLES_S = 3.0
+TOGGLES_S = 2.0
 MOVES_M_S, TOGGLED_WAY_M = 0.02, 0.3
-GRIPPER_S = 4.0
+GRIPPER_S = 3.0
 STALL_S = 1.0
 
 
@@ -52,29 +53,29 @@ def held_m(loop: Lockstep) -> FloatArray:
 
 def test_a_worker_that_takes_over_in_motion_goes_on_without_a_jump() -> None:
     loop = begin(UP, others={"other": Asked("other")})
-    loop.run(0.8)
+    loop.run(STARTED_S)
     steps = loop.commander.progress.steps
     since = mark(loop)
     loop.put("worker", "other")
-    loop.run(0.8)
+    loop.run(0.6)
     assert loop.commander.task.worker == "other"
     assert speed_m_s(loop)[since:].min() > 0.3 * SPEED_M_S  # it does not stop in between
     steps += loop.commander.progress.steps
     loop.put("prompt", HOLD)
-    loop.run(1.2)
+    loop.run(0.8)
     way = path_m(loop)[-1] - path_m(loop)[0]
     assert way == pytest.approx([0.0, 0.0, STEP_M * steps], abs=EXACT_M)
     check_motion(loop)
 
 
 def test_a_prompt_that_changes_in_motion_turns_the_arm_without_a_jump() -> None:
-    loop = moving(0.8)
+    loop = moving(0.6)
     steps = loop.commander.progress.steps
     loop.put("prompt", f"0 {STEP_M} 0")
-    loop.run(0.8)
+    loop.run(0.6)
     aside = loop.commander.progress.steps
     loop.put("prompt", HOLD)
-    loop.run(1.2)
+    loop.run(0.8)
     way = path_m(loop)[-1] - path_m(loop)[0]
     assert way == pytest.approx([0.0, STEP_M * aside, STEP_M * steps], abs=EXACT_M)
     assert speed_m_s(loop)[-1] < STILL_M_S
@@ -83,14 +84,14 @@ def test_a_prompt_that_changes_in_motion_turns_the_arm_without_a_jump() -> None:
 
 def test_a_rate_that_changes_in_motion_loses_no_step() -> None:
     loop = begin(f"0 0 {STEP_M / 2}")
-    for rate_hz in (10.0, 2.0, 20.0, 5.0):
+    for rate_hz in (2.0, 20.0, 5.0):
         loop.put("rate", rate_hz)
         loop.run(0.8)
     loop.run(0.1)  # half a step: no chunk is under way that is in force and not counted any more
     steps = loop.commander.progress.steps
     assert steps > 15
     loop.put("prompt", HOLD)
-    loop.run(1.2)
+    loop.run(0.8)
     way = path_m(loop)[-1] - path_m(loop)[0]
     assert way == pytest.approx([0.0, 0.0, STEP_M / 2 * steps], abs=EXACT_M)
     check_motion(loop)
@@ -100,31 +101,31 @@ def test_stop_in_motion_stops_the_arm_and_only_a_reset_frees_it() -> None:
     loop = moving()
     since = mark(loop)
     loop.put("stop")
-    loop.run(0.5)
+    loop.run(0.3)
+    assert loop.commander.state.value == "stopped"
+    assert loop.commander.at_rest
     loop.put("active", True)
-    loop.run(0.5)
+    loop.run(0.3)
     check_stop(loop, since, BRAKE)
     loop.put("reset")
-    loop.run(0.3)
+    loop.run(0.2)
     assert way_m(loop, since) < BRAKE[1]
-    activate(loop)
-    loop.run(0.5)
-    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    goes_on(loop)
     check_motion(loop)
 
 
-@pytest.mark.parametrize("wait_s", [0.02, 0.06, 0.12])
+@pytest.mark.parametrize(
+    "wait_s", [0.06, *(pytest.param(s, marks=pytest.mark.long) for s in (0.02, 0.12))]
+)
 def test_activated_while_it_still_moves_it_does_not_jump(wait_s: float) -> None:
     loop = moving(STARTED_S)
     loop.put("active", False)
     loop.run(wait_s)
-    activate(loop)
-    loop.run(0.8)
-    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    goes_on(loop)
     check_motion(loop)
 
 
-@pytest.mark.parametrize("wait_s", [0.14, 0.2, 0.35])
+@pytest.mark.parametrize("wait_s", [0.14, pytest.param(0.2, marks=pytest.mark.long), 0.35])
 def test_activated_during_or_after_the_robots_own_brake_it_does_not_jump(wait_s: float) -> None:
     loop = moving(STARTED_S)
     loop.tamper = dropped(PoseCommand)
@@ -135,16 +136,14 @@ def test_activated_during_or_after_the_robots_own_brake_it_does_not_jump(wait_s:
         loop.run(0.02)
         assert loop.commander.state.value == "inactive"
     loop.run(0.3)  # the command node still streams where its own brake ended
-    activate(loop)
-    loop.run(0.8)
-    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
+    goes_on(loop)
     check_motion(loop, own_brake=True)
 
 
 def test_activated_away_from_where_its_controller_holds_it_the_arm_is_not_pulled() -> None:
     loop = begin("0 0.01 0")
     loop.put("active", False)
-    loop.run(0.5)
+    loop.run(0.3)
     # It feels nothing, and is stopped before it is led back.
     loop.tamper = changed(PoseState, wrench=None)
     loop.run(0.1)
@@ -153,7 +152,7 @@ def test_activated_away_from_where_its_controller_holds_it_the_arm_is_not_pulled
     loop.world.place("box", (x_m, y_m + 0.25, z_m + 0.05))
     assert loop.run_until(lambda: loop.commander.state.value != "active", 3.0)
     loop.put("stop")
-    loop.run(1.0)
+    loop.run(0.5)
     loop.put("reset")
     loop.run(0.1)
     at = path_m(loop)[-1]
@@ -161,7 +160,7 @@ def test_activated_away_from_where_its_controller_holds_it_the_arm_is_not_pulled
     assert np.linalg.norm(held - at) > 0.03
     loop.put("prompt", HOLD)
     activate(loop)
-    loop.run(1.5)
+    loop.run(1.0)
     # Its controller is led back to where the arm is.
     assert np.linalg.norm(held_m(loop) - path_m(loop)[-1]) < 0.01
     assert np.linalg.norm(path_m(loop)[-1] - at) < 0.01
@@ -172,13 +171,13 @@ def test_active_toggled_ten_times_a_second_stays_smooth() -> None:
     # Often, so that the arm is under way each time before it is told to stop again.
     loop = begin(UP, rate_hz=30.0)
     for toggle in range(round(TOGGLES_S * 10)):
-        if toggle % 15 == 0:  # there and back, for the workspace ends
-            loop.put("prompt", UP if toggle % 30 == 0 else f"0 0 -{STEP_M}")
+        if toggle % 10 == 0:  # there and back, for the workspace ends
+            loop.put("prompt", UP if toggle % 20 == 0 else f"0 0 -{STEP_M}")
         loop.put("active", toggle % 2 == 1)
         loop.run(0.1)
     since = mark(loop)
     loop.put("active", False)
-    loop.run(1.0)
+    loop.run(0.4)
     assert stop_time_s(loop, since) < BRAKE[0]
     assert speed_m_s(loop).max() > MOVES_M_S
     assert way_m(loop, 1) < TOGGLED_WAY_M
@@ -188,7 +187,7 @@ def test_active_toggled_ten_times_a_second_stays_smooth() -> None:
 def test_a_stop_while_something_is_held_does_not_drop_it() -> None:
     loop = begin()
     loop.world.place("brick", (0.43, 0.0, 0.0096))
-    for prompt, duration_s in (("0 0 -0.02", 0.75), (f"{HOLD} -0.03", 1.5), (UP, 0.8)):
+    for prompt, duration_s in (("0 0 -0.02", 0.75), (f"{HOLD} -0.03", 1.0), (UP, 0.6)):
         loop.put("prompt", prompt)
         loop.run(duration_s)
     assert loop.world.gripper_state().holding
@@ -196,14 +195,14 @@ def test_a_stop_while_something_is_held_does_not_drop_it() -> None:
     held = loop.world.objects()["brick"][0] - loop.world.tcp()[0]
     since = mark(loop)
     loop.put("stop")
-    loop.run(0.8)
+    loop.run(0.4)
     assert stop_time_s(loop, since) <= BRAKE[0]
     assert loop.world.gripper_state().holding
     slipped = loop.world.objects()["brick"][0] - loop.world.tcp()[0] - held
     assert np.linalg.norm(slipped) < SLIP_M
     loop.put("reset")
     activate(loop)
-    loop.run(0.8)
+    loop.run(0.6)
     assert loop.world.gripper_state().holding
     assert loop.world.objects()["brick"][0][2] > 0.05
     check_motion(loop, contact=True)
@@ -230,7 +229,7 @@ def test_a_gripper_told_to_open_and_close_twenty_times_a_second_neither_stacks_n
     assert min(travel_m) > 0.005
     count = len(sent_ns)
     loop.put("prompt", f"{HOLD} 0.08")
-    loop.run(2.5)
+    loop.run(1.5)
     assert len(sent_ns) - count <= 3  # nothing was queued
     assert loop.world.gripper_state().width_m == pytest.approx(0.08, abs=EXACT_M)
     assert way_m(loop, 1) < EXACT_M

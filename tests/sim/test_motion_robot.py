@@ -56,10 +56,10 @@ def test_without_robot_state_the_arm_stops() -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = dropped(*STATES)
-    loop.run(0.6)
+    loop.run(0.5)
     check_stop(loop, since, LOST)
     loop.tamper = None
-    loop.run(0.3)
+    loop.run(0.2)
     assert way_m(loop, since) < LOST[1]
     goes_on(loop)
     check_motion(loop)
@@ -69,7 +69,7 @@ def test_a_state_that_is_said_again_and_again_stops_the_arm() -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = frozen(*STATES, payload_only=False)
-    loop.run(0.6)
+    loop.run(0.5)
     check_stop(loop, since, LOST)
     check_motion(loop)
 
@@ -78,7 +78,7 @@ def test_a_sensor_that_is_stuck_stops_the_arm() -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = frozen(PoseState, payload_only=True)
-    loop.run(0.7)
+    loop.run(0.6)
     check_stop(loop, since, FROZEN)
     check_motion(loop)
 
@@ -96,14 +96,14 @@ def shifted(by_m: float) -> Tamper:
 
 
 def test_a_measured_pose_that_jumps_a_little_moves_nothing() -> None:
-    np.testing.assert_array_equal(after(1.0, shifted(0.02)), undisturbed(1.0))
+    np.testing.assert_array_equal(after(0.5, shifted(0.02)), undisturbed(0.5))
 
 
 def test_a_measured_pose_that_jumps_far_stops_the_arm() -> None:
-    loop = moving()
+    loop = moving(1.2)
     since = mark(loop)
     loop.tamper = shifted(0.2)
-    loop.run(0.5)
+    loop.run(0.4)
     check_stop(loop, since, BRAKE)
     check_motion(loop)
 
@@ -114,19 +114,19 @@ def test_an_arm_that_is_blocked_pushes_no_harder_than_it_may_and_is_led_back() -
     # A wall of the open box, which cannot be pushed away, beside the hand.
     loop.world.place("box", (x_m, y_m + 0.25, z_m + 0.05))
     push_n: list[float] = []
-    for _ in range(350):
+    for _ in range(310):
         loop.run(0.01)
         push_n.append(norm3(loop.world.wrench()[:3]))
     assert max(push_n) > 10.0  # it did touch
     assert max(push_n) < PUSH_N
     assert loop.commander.state.value == "inactive"
     assert "contact_force" in loop.commander.why
-    assert max(push_n[-100:]) < LASTING_N
+    assert max(push_n[-50:]) < LASTING_N
     blocked_m = path_m(loop)[-1]
-    assert speed_m_s(loop)[-125:].max() < STILL_M_S
+    assert speed_m_s(loop)[-100:].max() < STILL_M_S
     loop.put("prompt", "0 -0.01 0")
     activate(loop)
-    loop.run(1.0)
+    loop.run(0.6)
     assert path_m(loop)[-1, 1] < blocked_m[1] - 0.02  # it comes away
     assert push_n[-1] >= norm3(loop.world.wrench()[:3])
     check_motion(loop, contact=True)
@@ -136,25 +136,25 @@ def test_an_arm_pressed_on_the_table_stops() -> None:
     loop = begin("0 0 -0.02")
     tilt = 0.02  # the table is higher than anybody knows
     loop.world.place("box", (0.43 + 0.0685, 0.0, 0.05 + tilt))
-    loop.run(2.5)
+    loop.run(2.3)
     rest_m = path_m(loop)[-1]
-    assert speed_m_s(loop)[-125:].max() < STILL_M_S
+    assert speed_m_s(loop)[-100:].max() < STILL_M_S
     assert norm3(loop.world.wrench()[:3]) < LASTING_N
     assert rest_m[2] > 0.06
     check_motion(loop, contact=True)
 
 
-@pytest.mark.parametrize("mode", ["user_stopped", "guiding"])
+@pytest.mark.parametrize("mode", ["user_stopped", pytest.param("guiding", marks=pytest.mark.long)])
 def test_a_robot_that_is_switched_to_another_mode_stops_and_waits(mode: str) -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = changed(GripperState, mode=mode)
-    loop.run(0.6)
+    loop.run(0.4)
     check_stop(loop, since, BRAKE)
     loop.put("active", True)
-    loop.run(0.3)
+    loop.run(0.2)
     loop.tamper = None
-    loop.run(0.3)
+    loop.run(0.2)
     assert way_m(loop, since) < BRAKE[1]  # being ready again does not start it
     goes_on(loop)
     check_motion(loop)
@@ -165,14 +165,14 @@ def test_a_robot_that_is_switched_off_and_on_moves_again_only_when_it_is_told() 
     since = mark(loop)
     loop.alive.discard(SIM)
     loop.tamper = dropped(*STATES, PoseCommand, GripperCommand)
-    loop.run(0.8)
+    loop.run(0.5)
     check_stop(loop, since, SILENT)
     loop.put("active", True)
-    loop.run(0.3)
+    loop.run(0.2)
     loop.guard.reset()
     loop.alive.add(SIM)
     loop.tamper = None
-    loop.run(0.5)
+    loop.run(0.3)
     assert way_m(loop, since) < SILENT[1]
     goes_on(loop)
     check_motion(loop, own_brake=True)
@@ -182,7 +182,7 @@ def test_a_camera_that_lies_ends_the_motion_and_has_to_be_good_again_to_activate
     loop = moving()
     since = mark(loop)
     loop.camera_faults["front"] = "shows the same picture since 1.0 s"
-    loop.run(0.5)
+    loop.run(0.4)
     assert loop.commander.why == "camera 'front' shows the same picture since 1.0 s"
     check_stop(loop, since, BRAKE)
     loop.put("active", True)
@@ -194,7 +194,7 @@ def test_a_camera_that_lies_ends_the_motion_and_has_to_be_good_again_to_activate
 
 
 def test_without_commands_the_robot_brakes_by_itself_and_nothing_jumps_afterwards() -> None:
-    loop = moving()
+    loop = moving(1.2)
     since = mark(loop)
     loop.tamper = dropped(PoseCommand)
     loop.run(0.3)
@@ -210,7 +210,7 @@ def test_without_commands_the_robot_brakes_by_itself_and_nothing_jumps_afterward
 def test_a_stream_whose_beginning_is_lost_moves_nothing_and_ends_the_activation() -> None:
     loop = begin()
     loop.put("active", False)
-    loop.run(1.0)
+    loop.run(0.3)
     loop.put("prompt", UP)
     loop.run(0.2)
     since = mark(loop)
@@ -223,7 +223,7 @@ def test_a_stream_whose_beginning_is_lost_moves_nothing_and_ends_the_activation(
     loop.run(0.05)
     assert loop.commander.state.value == "inactive"
     assert "unheeded" in loop.commander.why
-    loop.run(1.0)
+    loop.run(0.4)
     assert way_m(loop, since) < STANDS_M
     goes_on(loop)
     check_motion(loop)
@@ -236,17 +236,17 @@ def ahead_m(loop: Lockstep, since: int) -> float:
 
 
 def test_a_goal_out_of_reach_is_approached_and_no_further() -> None:
-    loop = begin("0.02 0 0.02", bounded=True)
-    loop.run(4.5)
+    loop = begin("0.03 0 0.03", bounded=True)
+    loop.run(3.2)
     commanded = loop.trace.commands[-1]
     assert commanded is not None
-    assert way_m(loop, mark(loop) - 250) < STANDS_M  # while it is told to go on
+    assert way_m(loop, mark(loop) - 125) < STANDS_M  # while it is told to go on
     assert norm3(path_m(loop)[-1] - commanded.position_m) < STANDS_M
     assert path_m(loop)[-1, 0] < loop.profile.limits.workspace.x_m[1] + STANDS_M
     assert loop.commander.state.value == "active"
     assert any(event.kind == "limit" for event in loop.events)
     loop.put("prompt", "-0.02 0 -0.02")
-    loop.run(1.0)
+    loop.run(0.5)
     assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S  # and back at once
     check_motion(loop, singular=True)
 
@@ -255,11 +255,11 @@ def test_a_step_no_arm_can_make_is_not_begun() -> None:
     loop = moving()
     since = mark(loop)
     loop.put("prompt", "0 0 5")
-    loop.run(0.6)
+    loop.run(0.5)
     assert loop.refused["step_m"] > 0
     assert stop_time_s(loop, since) < 0.35
     assert speed_m_s(loop)[since:].max() < 1.15 * SPEED_M_S
     loop.put("prompt", UP)
-    loop.run(0.5)
+    loop.run(0.4)
     assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
     check_motion(loop)
