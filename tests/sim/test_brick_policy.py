@@ -50,7 +50,7 @@ ORDERS = (
     Order("push", "yellow", direction="closer"),
 )
 PROFILE = "panda_bricks"
-LIMIT_S, STAY_S = 20.0, 2.0
+LIMIT_S, STAY_S = 20.0, 1.0
 CAMERA_SIZE = (320, 240)
 MAX_WEIGHTS_BYTES = 9_000_000
 SEED = 5

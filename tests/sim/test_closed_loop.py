@@ -158,16 +158,17 @@ def test_steps_up_add_up_to_their_whole_way_at_every_rate(rate_hz: float, count:
     check_stream(run.loop)
 
 
-def test_fifty_steps_up_are_half_a_metre_with_a_slow_and_unsteady_model() -> None:
-    run = carry_out(begin(5.0, make_world(), LATE), "go up", 50)
-    check_translation(run, 2, 0.5)
+@pytest.mark.parametrize("count", [15, pytest.param(50, marks=pytest.mark.long)])
+def test_steps_up_add_up_to_their_whole_way_with_a_slow_and_unsteady_model(count: int) -> None:
+    run = carry_out(begin(5.0, make_world(), LATE), "go up", count)
+    check_translation(run, 2, 0.01 * count)
     assert norm3(run.turned_rad) < DRIFT_RAD
     check_stream(run.loop)
 
 
 def test_chunks_of_many_steps_that_overlap_end_where_they_were_to() -> None:
-    run = carry_out(begin(3.0, make_world(), LATE, horizon="8"), "go up", 30)
-    check_translation(run, 2, 0.3)
+    run = carry_out(begin(3.0, make_world(), LATE, horizon="8"), "go up", 16)
+    check_translation(run, 2, 0.16)
     check_stream(run.loop)
 
 
@@ -182,8 +183,8 @@ def test_every_direction_is_exact_and_moves_nothing_else() -> None:
     loop = begin(10.0, make_world(), policy=Straight())
     for axis, name in enumerate("xyz"):
         for sign in (1, -1):
-            run = carry_out(loop, f"{'+' if sign > 0 else '-'}{name}", 8)
-            check_translation(run, axis, sign * 0.08)
+            run = carry_out(loop, f"{'+' if sign > 0 else '-'}{name}", 3)
+            check_translation(run, axis, sign * 0.03)
             assert norm3(run.turned_rad) < DRIFT_RAD
     check_stream(loop)
 
@@ -193,14 +194,14 @@ def test_every_direction_is_exact_and_moves_nothing_else() -> None:
     [
         pytest.param("roll right", "roll left", 0, 12, marks=pytest.mark.slow),
         pytest.param("pitch down", "pitch up", 1, 12, marks=pytest.mark.slow),
-        ("yaw left", "yaw right", 2, 12),
+        ("yaw left", "yaw right", 2, 4),
     ],
 )
 def test_every_rotation_turns_about_its_own_axis_and_moves_nothing(
     there: str, back: str, axis: int, count: int
 ) -> None:
     loop = begin(10.0, make_world())
-    carry_out(loop, "go up", 15)
+    carry_out(loop, "go up", count)
     for prompt, sign in ((there, 1), (back, -1)):
         run = carry_out(loop, prompt, count)
         expected = np.zeros(3)
@@ -223,23 +224,10 @@ def test_the_gripper_closes_and_opens() -> None:
         assert norm3(run.moved_m) < OFF_AXIS_M
 
 
-def test_stop_in_full_motion_brakes_the_arm_itself_gently() -> None:
-    loop = begin(10.0, make_world())
-    loop.put("prompt", "HARD: go up")
-    loop.run(2.0)
-    at_m = loop.world.tcp()[0][2]
-    loop.put("stop")
-    loop.run(1.0)
-    assert loop.commander.state.value == "stopped"
-    assert loop.commander.at_rest
-    assert 0.0 < loop.world.tcp()[0][2] - at_m < 0.05
-    check_stream(loop)
-
-
 def test_a_run_is_the_same_to_the_bit_when_it_is_repeated() -> None:
     def run() -> tuple[np.ndarray, list[np.ndarray]]:
         loop = begin(10.0, make_world(seed=3), LATE)
-        carry_out(loop, "go up", 5)
+        carry_out(loop, "go up", 2)
         return loop.world.qpos(), loop.trace.position_m
 
     (first, path), (second, again) = run(), run()
@@ -275,7 +263,11 @@ def way_without_a_command_node(rate_hz: float, *, on_measured: bool) -> np.ndarr
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "thesis_m"), [pytest.param(1.0, 0.20, marks=pytest.mark.slow), (5.0, 0.11)]
+    ("rate_hz", "thesis_m"),
+    [
+        pytest.param(1.0, 0.20, marks=pytest.mark.slow),
+        pytest.param(5.0, 0.11, marks=pytest.mark.long),
+    ],
 )
 def test_composing_on_the_measured_pose_fails_as_in_the_thesis(
     rate_hz: float, thesis_m: float
@@ -285,6 +277,7 @@ def test_composing_on_the_measured_pose_fails_as_in_the_thesis(
     assert norm3(np.array([*lost[:2], 0.0])) > THESIS_SIDEWAYS_M
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate_hz", [pytest.param(1.0, marks=pytest.mark.slow), 5.0])
 def test_composing_on_the_goal_keeps_the_way_with_the_same_arm(rate_hz: float) -> None:
     kept = way_without_a_command_node(rate_hz, on_measured=False)

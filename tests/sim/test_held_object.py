@@ -34,7 +34,7 @@ def bottom_m(loop: Lockstep) -> float:
 def test_a_held_bar_stops_above_the_table(loop: Lockstep) -> None:
     loop.put("held", BAR)
     loop.put("prompt", DOWN)
-    loop.run(4.0)
+    loop.run(2.0)
     reach = shipped().limits.reach
     assert reach.table_z_m is not None
     assert bottom_m(loop) > reach.table_z_m + reach.table_stop_m - LAG_M
@@ -53,7 +53,7 @@ def test_a_bar_that_is_grasped_on_the_table_is_lifted(loop: Lockstep) -> None:
     loop.run(0.2)
     before_m = float(path_m(loop)[-1, 2])
     loop.put("prompt", "0 0 0.02")
-    loop.run(1.5)
+    loop.run(0.9)
     assert path_m(loop)[-1, 2] > before_m + 0.1
     assert loop.commander.state.value == "active"
 

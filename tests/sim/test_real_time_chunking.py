@@ -14,7 +14,7 @@ from vla_zenoh.profile import load_profile
 HORIZON, DT_S, RATE_HZ = 8, 0.1, 2.5
 STEP_M = 0.006
 LATE = Delays(inference_s=0.25, camera_s=0.02)
-RUN_S = 6.0
+RUN_S = 3.0
 ONE_STEP_M = 1.05 * STEP_M
 """What the goal moves by within a chunk, and rounding."""
 
