@@ -42,7 +42,7 @@ QUATERNION_TOLERANCE = 1e-15
 DECODES = 10
 MAX_SENTENCE = 8000  # characters of an error message
 KINDS = sorted(RECORDS, key=lambda kind: kind.__name__)
-NOTHING_TAKEN = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+NOTHING_TAKEN = settings(max_examples=20, suppress_health_check=[HealthCheck.too_slow])
 
 by_kind = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 
@@ -137,27 +137,16 @@ def test_arbitrary_bytes_are_refused_or_read(kind: type, payload: bytes) -> None
 @by_kind
 @given(data=st.data())
 @NOTHING_TAKEN
-def test_a_truncated_record_is_refused_and_one_with_flipped_bits_or_read(
+def test_a_truncated_record_is_refused_and_a_spoilt_one_or_read_as_any_reader_does(
     kind: type, data: st.DataObject
 ) -> None:
     payload = bytearray(records.encode(data.draw(RECORDS[kind])))
     cut = data.draw(st.integers(0, len(payload) - 1))
     with pytest.raises(CodecError):
         records.decode(kind, bytes(payload[:cut]))
-    for _ in range(data.draw(st.integers(1, 4))):
-        payload[data.draw(st.integers(0, len(payload) - 1))] ^= 1 << data.draw(st.integers(0, 7))
-    assert decoded_or_refused(kind, bytes(payload))
-
-
-@by_kind
-@given(data=st.data())
-@NOTHING_TAKEN
-def test_a_spoilt_record_that_is_read_holds_what_any_reader_finds(
-    kind: type, data: st.DataObject
-) -> None:
-    payload = bytearray(records.encode(data.draw(RECORDS[kind])))
     for _ in range(data.draw(st.integers(0, 9))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    assert decoded_or_refused(kind, bytes(payload))
     with suppress(CodecError):
         read = records.decode(kind, bytes(payload))
         plain = records.from_map(kind, message.unpack(bytes(payload)))
