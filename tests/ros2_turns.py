@@ -36,6 +36,8 @@ from vla_zenoh.types import (
     PoseState,
 )
 
+HOME = panda().forward(HOME_RAD)
+HOME_QUAT = quat_from_rotation(HOME.rotation)
 TICK_S, RAMP_S = 0.004, 0.24
 TICK_NS = 4_000_000
 SPEED_M_S = 0.2
@@ -98,8 +100,7 @@ class Turns:
         speed = SPEED_M_S * (1 - np.cos(turn_1_s * begun_s)) / 2
         ramp_m = SPEED_M_S * (begun_s - np.sin(turn_1_s * begun_s) / turn_1_s) / 2
         way_m = ramp_m + SPEED_M_S * (self.moved_s - begun_s)
-        home = panda().forward(HOME_RAD)
-        at_m, quat = home.position_m + (0.0, 0.0, way_m), quat_from_rotation(home.rotation)
+        at_m, quat = HOME.position_m + (0.0, 0.0, way_m), HOME_QUAT
         change = SPEED_M_S * turn_1_s * np.sin(turn_1_s * begun_s) / 2
         twist, acceleration = np.zeros(6), np.zeros(6)
         twist[2], acceleration[2] = speed, change
