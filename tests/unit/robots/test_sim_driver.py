@@ -113,18 +113,17 @@ def test_a_reset_puts_the_arm_home_and_is_counted(driver: SimDriver) -> None:
     assert not driver.status_changed()
 
 
-@pytest.mark.parametrize("name", ["panda_sim", "two_pandas_sim"])
-@pytest.mark.parametrize("mode", ["pose", "joint"])
+@pytest.mark.parametrize(("mode", "name"), [("pose", "two_pandas_sim"), ("joint", "panda_sim")])
 def test_every_arm_brakes_by_itself_when_a_stop_is_put(name: str, mode: str) -> None:
     with routed_session() as session:
         node = RobotNode(SimDriver(load_profile(name), lockstep=True), session)
         writers = [StreamWriter(arm, mode) for arm in node.arms.values()]
         fastest_rad_s = 0.0
-        for step in range(1, 1500):
+        for step in range(1, 1000):
             if step % 4 == 0:
                 for writer in writers:
                     session.put(*writer.command(step), attachment=writer.header(step))
-            if step == 500:
+            if step == 400:
                 assert all(arm.guard.following for arm in node.arms.values())
                 assert node.driver.status().detail["command"] == mode
                 session.put(node.node.keys.stop, "stop")
