@@ -160,9 +160,13 @@ class Rig:
         self.put("active", True)
         assert self.state == "active", self.commander.why
 
-    def settle(self, duration_s: float = 1.5) -> None:
-        """Let the arm come to where it is to go."""
-        self.run(duration_s)
+    def settle(self, most_s: float = 1.5) -> None:
+        """Let the arm come to where it is to go, and stand there for 0.1 s."""
+        for _ in range(round(most_s / 0.1)):
+            before_m = self.position_m
+            self.run(0.1)
+            if self.commander.at_rest and np.array_equal(before_m, self.position_m):
+                return
         assert self.commander.at_rest
 
     def stand_at(self, kinematics: Kinematics, joints_rad: FloatArray) -> None:

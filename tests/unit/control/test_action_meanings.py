@@ -23,6 +23,7 @@ from vla_zenoh.profile.limits import Workspace
 from vla_zenoh.types import FloatArray, PoseState
 
 ATOL = 1e-9
+FEW = settings(max_examples=25)
 START = Pose(np.array([0.45, -0.1, 0.3]), exp3(np.array([2.8, 0.3, -0.5])))
 OSC = {"dt_s": 0.05, "controller": ControllerSpec(kp=150.0)}
 POSITION_M, ROTATION_RAD = 0.05, 0.5
@@ -61,6 +62,7 @@ def joint_columns(kind: str, relative_to: str, steps: FloatArray) -> FloatArray:
     return rows if kind == "absolute" else STATE_RAD + np.cumsum(rows, axis=0)
 
 
+@FEW
 @given(chunks)
 def test_joints_of_a_chunk_are_those_of_their_sources(steps: FloatArray) -> None:
     # openpi's AbsoluteActions adds the state to every row, DROID's delta the row before; a velocity
@@ -76,6 +78,7 @@ def test_joints_of_a_chunk_are_those_of_their_sources(steps: FloatArray) -> None
 
 
 # -- references -----------------------------------------------------------------------------------
+@FEW
 @given(chunks)
 def test_umi_puts_every_pose_of_a_chunk_on_the_pose_of_the_observation(steps: FloatArray) -> None:
     action = spec(frame="tcp", relative_to="start", anchor="measured")
@@ -83,6 +86,7 @@ def test_umi_puts_every_pose_of_a_chunk_on_the_pose_of_the_observation(steps: Fl
     assert_same(chunk_poses(action, steps, START), [matrix(START) @ each for each in relative])
 
 
+@FEW
 @given(chunks)
 def test_openpi_adds_every_delta_of_a_chunk_to_the_state(steps: FloatArray) -> None:
     steps[:, 3:] = 0.0
@@ -93,6 +97,7 @@ def test_openpi_adds_every_delta_of_a_chunk_to_the_state(steps: FloatArray) -> N
     np.testing.assert_allclose(reached, absolute, atol=ATOL)
 
 
+@FEW
 @given(chunks, st.sampled_from(["base", "tcp"]))
 def test_a_velocity_is_integrated_over_each_step(steps: FloatArray, frame: str) -> None:
     action, parts = spec(kind="velocity", frame=frame, dt_s=0.25), 50
@@ -109,6 +114,7 @@ def test_a_velocity_is_integrated_over_each_step(steps: FloatArray, frame: str) 
     assert_same(chunk_poses(action, steps, START), wanted)
 
 
+@FEW
 @given(
     chunks,
     st.sampled_from(["base", "tcp"]),
@@ -155,7 +161,7 @@ def osc_steps(numbers: Any) -> FloatArray:
     return clipped * np.repeat([POSITION_M, ROTATION_RAD], 3)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10)
 @given(inputs, st.data())
 def test_osc_moves_as_robosuites_update_of_its_goal_says(
     numbers: list[FloatArray], data: st.DataObject
@@ -186,8 +192,8 @@ def test_twenty_steps_of_osc_move_a_quarter_of_their_sum(amplitude: float, moved
 @pytest.mark.parametrize("ratio", [0.3, 0.999999999, 1.0, 1.000000001, 2.5])
 def test_a_response_of_any_damping_is_that_of_the_equation(ratio: float) -> None:
     reference = OperationalSpaceController(START, kp=80.0, ratio=ratio)
-    rows = [np.array([0.4, -0.2, 0.1, 0.1, 0.0, 0.0])] * 6
-    wanted = [reference.step(row, parts=2000).position_m for row in rows]
+    rows = [np.array([0.4, -0.2, 0.1, 0.1, 0.0, 0.0])] * 3
+    wanted = [reference.step(row, parts=1000).position_m for row in rows]
     action = spec(dt_s=0.05, controller=ControllerSpec(kp=80.0, damping_ratio=ratio))
     reached = chunk_poses(action, osc_steps(rows), START)
     np.testing.assert_allclose([pose.position_m for pose in reached], wanted, atol=5e-5)
@@ -214,7 +220,7 @@ def plan_of(action: ActionSpec, timeline: GoalTimeline, observed_ns: int, steps:
     return plan
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10)
 @given(st.lists(small, min_size=4, max_size=10), st.data())
 def test_a_response_goes_on_where_the_next_chunk_begins(
     steps: list[FloatArray], data: st.DataObject
@@ -278,8 +284,9 @@ def umi_chunk(rig: Rig, target_m: FloatArray, speed_m_s: float) -> FloatArray:
     return np.array(rows)
 
 
-@pytest.mark.parametrize("latency_s", [0.0, 0.1])
-@pytest.mark.parametrize("mode", ["replace", "blend", "ensemble"])
+@pytest.mark.parametrize(
+    ("mode", "latency_s"), [("replace", 0.1), ("blend", 0.0), ("blend", 0.1), ("ensemble", 0.1)]
+)
 def test_a_chunk_relative_to_the_observation_goes_as_far_as_it_says(
     mode: str, latency_s: float
 ) -> None:
@@ -331,8 +338,9 @@ def test_a_velocity_moves_for_as_long_as_its_steps_and_then_the_arm_stands() -> 
     rig.assert_smooth()
 
 
-@pytest.mark.parametrize("steps_a_chunk", [1, 4, 10, 20])
-@pytest.mark.parametrize("latency_s", [0.0, 0.08])
+@pytest.mark.parametrize(
+    ("steps_a_chunk", "latency_s"), [(1, 0.0), (1, 0.08), (10, 0.08), (20, 0.0)]
+)
 def test_twenty_steps_of_osc_move_the_arm_as_far_in_any_chunks(
     steps_a_chunk: int, latency_s: float
 ) -> None:
@@ -359,12 +367,12 @@ def test_twenty_steps_of_osc_move_the_arm_as_far_in_any_chunks(
     rig.assert_smooth()
 
 
-@pytest.mark.parametrize("back_s", [0.06, 1.5, 3600.0])
+@pytest.mark.parametrize("back_s", [0.06, 3600.0])
 def test_after_the_clock_was_set_back_a_measured_anchor_is_where_the_arm_is(back_s: float) -> None:
     rig = Rig(dt_s=0.2, anchor="measured")
     rig.activate()
     rig.run(0.3)
-    for _ in range(8):
+    for _ in range(4):
         rig.send([[0.04, 0, 0, 0, 0, 0, 0]] * 5, observed_ago_s=0.05)
         rig.run(0.2)
     rig.now_ns -= round(back_s * 1e9)
@@ -390,6 +398,7 @@ def test_a_pose_from_the_future_says_nothing_about_the_past() -> None:
     assert history.around(ahead_ns, 20_000_000) is None
 
 
+@FEW
 @given(
     kp=st.floats(1.0, 1e4),
     ratio=st.floats(0.1, 10.0),

@@ -73,7 +73,7 @@ def test_only_neighbours_and_what_no_joint_moves_are_left_out() -> None:
     left_out = {str(pair) for pair in everything.pairs} - checked
     rng = np.random.default_rng(5)
     indices = [k for k, pair in enumerate(everything.pairs) if str(pair) in left_out]
-    for _ in range(2000):
+    for _ in range(500):
         joints_rad = KINEMATICS.lower_rad + SPAN_RAD * rng.random(KINEMATICS.size)
         distances_m = everything.distances(joints_rad)[indices]
         assert distances_m.min() > LIMITS.collision_stop_m
@@ -137,7 +137,7 @@ def lowest_m(rig: Rig, profile: Profile) -> float:
 
 @pytest.mark.parametrize(
     ("command", "height_m"),
-    [("pose", 0.0085), ("joint", 0.015), ("pose", 0.0185), ("joint", 0.022)],
+    [("pose", 0.0085), ("joint", 0.022)],
 )
 def test_a_panda_that_begins_near_the_table_does_not_go_into_it(
     command: str, height_m: float
@@ -158,7 +158,7 @@ def test_a_panda_that_begins_near_the_table_does_not_go_into_it(
     fingers_m = 0.0085 + LIMITS.table_stop_m
     assert min(places_m) > min(height_m, fingers_m) - 1e-4
     arm.tick(chunks=[rig.chunk([[0.0, 0.0, 0.01, 0.0, 0.0, 0.0]] * 4)])
-    arm.run(1.5)
+    arm.run(0.8)
     assert lowest_m(rig, profile) > places_m[-1] + 0.005
 
 
@@ -184,7 +184,7 @@ def test_a_violated_barrier_does_not_creep_in_many_small_steps() -> None:
     shadow = ReachabilityFilter(low(0.005, "pose"), KINEMATICS)
     pose = KINEMATICS.forward(shadow.joints_rad)
     begin_m = float(pose.position_m[2])
-    for _ in range(300):
+    for _ in range(100):
         asked = Pose(pose.position_m - [0.0, 0.0, 1e-6], pose.rotation)
         search = shadow.bound_in_pieces(pose, asked, 0.02)
         try:
@@ -199,9 +199,8 @@ def test_a_violated_barrier_does_not_creep_in_many_small_steps() -> None:
 @pytest.mark.parametrize(
     ("mode", "command", "space"),
     [
-        *(("replace", "pose", "tcp"), ("replace", "joint", "joint")),
-        *(("blend", "pose", "joint"), ("blend", "joint", "tcp")),
-        *(("ensemble", "pose", "tcp"), ("ensemble", "joint", "joint")),
+        *(("replace", "joint", "joint"), ("blend", "pose", "joint")),
+        *(("blend", "joint", "tcp"), ("ensemble", "pose", "tcp")),
     ],
 )
 def test_an_arm_that_began_outside_the_box_never_gets_a_goal_further_out(

@@ -95,7 +95,7 @@ def whole_plan(
 ways = st.tuples(*[st.floats(-0.04, 0.04)] * 3, *[st.floats(-0.15, 0.15)] * 3, st.just(0.0))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20)
 @given(
     st.lists(ways, min_size=1, max_size=12),
     st.sampled_from(["base", "tcp"]),
@@ -131,13 +131,13 @@ def test_no_tick_evaluates_the_arm_more_often_than_its_budget_allows(mode: str) 
     budget = rig.commander._planner.budget
     assert budget <= 10
     most = total = 0
-    for tick in range(1, 400):
+    for tick in range(1, 200):
         IN_PIECES.count = 0
         chunks = [rig.chunk([DOWNWARDS] * 16, observed_ago_s=0.08)] if tick % 25 == 0 else []
         rig.tick(chunks=chunks)
         most, total = max(most, IN_PIECES.count), total + IN_PIECES.count
     assert most == budget
-    assert total > 20 * budget
+    assert total > 10 * budget
     assert any(event.what == "table_distance" for event in rig.events)
     rig.assert_smooth()
 
@@ -177,7 +177,7 @@ def test_chunks_that_come_while_another_is_bounded_lose_no_step() -> None:
     rig = arm_rig(dt_s=0.02)
     rig.run(0.4)
     asked, up = 0.0, [0.0, 0.0, 0.004, 0.0, 0.0, 0.0, 0.0]
-    for _ in range(4):
+    for _ in range(2):
         rig.send([up] * 12)
         rig.run(0.2)
         # Ten steps are due when it arrives; the next one comes before it is in force.
@@ -282,12 +282,11 @@ def go(rig: Rig, target: Any, duration_s: float, period_s: float = 0.1) -> None:
         rig.run(period_s - 0.004)
 
 
-@pytest.mark.parametrize("period_s", [0.1, 0.048])
-def test_a_far_absolute_target_is_approached_straight_and_slowly(period_s: float) -> None:
+def test_a_far_absolute_target_is_approached_straight_and_slowly() -> None:
     rig = absolute_rig()
-    target_m = START_M + [0.2, 0.25, 0.1]
+    target_m = START_M + [0.15, 0.15, 0.1]
     away_m = norm3(target_m - START_M)
-    go(rig, [*target_m, *DOWN], 6.0, period_s)
+    go(rig, [*target_m, *DOWN], 3.0, 0.1)
     rig.settle()
     assert rig.refused == {}
     np.testing.assert_allclose(rig.position_m, target_m, atol=AT_GOAL_M)
@@ -309,7 +308,7 @@ def test_a_far_absolute_target_is_approached_straight_and_slowly(period_s: float
 
 def test_a_far_turn_is_approached_likewise() -> None:
     rig = absolute_rig()
-    go(rig, [*START_M, *quat_of([0.0, 0.0, 1.5])], 4.0)
+    go(rig, [*START_M, *quat_of([0.0, 0.0, 1.5])], 3.0)
     rig.settle()
     np.testing.assert_allclose(rig.turned_rad(), [0, 0, 1.5], atol=1e-6)
     (event,) = [event for event in rig.events if event.what == "approach"]
@@ -381,7 +380,7 @@ def test_a_target_for_which_the_joints_are_too_slow_is_reached_slower() -> None:
         dt_s=0.1,
     )
     target_m = rig.position_m + [0.0, 0.14, 0.0]
-    go(rig, [*target_m, *DOWN], 5.0)
+    go(rig, [*target_m, *DOWN], 2.0)
     rig.settle()
     np.testing.assert_allclose(rig.position_m, target_m, atol=AT_GOAL_M)
     told = [event for event in rig.events if event.what == "joint_velocity"]

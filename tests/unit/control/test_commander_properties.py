@@ -139,7 +139,7 @@ def check(rig: Rig) -> None:
         rig.assert_smooth()
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(events)
 def test_rotation_vectors_and_base_deltas_of_any_kind_stay_within_every_limit(
     script: list[Any],
@@ -150,7 +150,7 @@ def test_rotation_vectors_and_base_deltas_of_any_kind_stay_within_every_limit(
     check(rig)
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(
     events,
     st.sampled_from(["rpy", "rotvec"]),

@@ -23,7 +23,7 @@ def test_absolute_joints_are_reached_exactly() -> None:
     arm = Joints()
     arm.activate()
     goal_rad = HOME_RAD + [0.3, 0.1, -0.3, 0.1, 0.2, 0.1, -0.4]
-    arm.follow(HOME_RAD + np.linspace(0, 1, 31)[1:, None] * (goal_rad - HOME_RAD))
+    arm.follow(HOME_RAD + np.linspace(0, 1, 16)[1:, None] * (goal_rad - HOME_RAD))
     arm.settle(goal_rad)
     assert arm.rig.state == "active"
     assert np.abs(arm.joints_rad - goal_rad).max() < EXACT_RAD
@@ -33,7 +33,7 @@ def test_absolute_joints_are_reached_exactly() -> None:
 def test_no_limit_is_broken_whatever_the_policy_asks(kind: str) -> None:
     rng, arm = np.random.default_rng(0), Joints(kind=kind)
     arm.activate()
-    for _ in range(14):
+    for _ in range(8):
         rows = (HOME_RAD + rng.uniform(-1.2, 1.2, (1, 7))) * np.ones((8, 1))
         if kind == "delta":
             rows = rng.uniform(-0.15, 0.15, (1, 7)) * np.ones((8, 1))
@@ -76,7 +76,7 @@ def test_an_elbow_swivels_as_asked_with_the_tcp_at_rest() -> None:
     goal_rad = swivelled(arm.kinematics, 0.9)
     assert np.abs(goal_rad - HOME_RAD).max() > 0.4
     arm.activate()
-    arm.go(goal_rad, 4.0)
+    arm.go(goal_rad, 2.5)
     assert np.abs(arm.joints_rad - goal_rad).max() < EXACT_RAD
     arm.assert_within_limits()
 
@@ -96,7 +96,7 @@ def test_fifty_random_smooth_motions_end_where_they_were_asked_to() -> None:
     arm.assert_within_limits()
 
 
-@pytest.mark.parametrize("rate_hz", [2.0, 5.0, 15.0])
+@pytest.mark.parametrize("rate_hz", [2.5, 15.0])
 def test_joint_deltas_are_carried_out_whole_however_often_the_model_is_asked(
     rate_hz: float,
 ) -> None:
@@ -105,7 +105,7 @@ def test_joint_deltas_are_carried_out_whole_however_often_the_model_is_asked(
     arm.activate()
     step_rad = np.array([0.02, 0.0, 0.0, 0.012, 0.0, 0.008, 0.0])
     first_ns = last_ns = 0
-    for _ in range(round(1.5 * rate_hz)):
+    for _ in range(round(0.8 * rate_hz)):
         first_ns = first_ns or arm.rig.now_ns
         last_ns = arm.rig.now_ns
         arm.send(*[step_rad] * 8)
@@ -149,16 +149,18 @@ def test_a_chunk_anchored_at_the_measured_joints_begins_where_they_were_observed
 # -- bounds ---------------------------------------------------------------------------------------
 def test_a_goal_beyond_a_joint_s_range_ends_at_its_margin_and_is_told() -> None:
     arm = Joints()
-    arm.activate()
     margin_rad = arm.profile.limits.reach.joint_margin_rad
-    end_rad = HOME_RAD.copy()
+    near_rad, end_rad = HOME_RAD.copy(), HOME_RAD.copy()
+    near_rad[6] = arm.kinematics.upper_rad[6] - margin_rad - 0.2
     end_rad[6] = arm.kinematics.upper_rad[6] + 0.2
-    arm.settle(end_rad, 8.0)
+    arm.at(near_rad)
+    arm.activate()
+    arm.settle(end_rad)
     assert arm.rig.state == "active", arm.rig.commander.why
     assert arm.joints_rad[6] == pytest.approx(arm.kinematics.upper_rad[6] - margin_rad, abs=1e-6)
     assert "joint_limit" in arm.hits()
-    arm.settle(HOME_RAD, 8.0)
-    assert arm.joints_rad == pytest.approx(HOME_RAD, abs=EXACT_RAD)
+    arm.settle(near_rad)
+    assert arm.joints_rad == pytest.approx(near_rad, abs=EXACT_RAD)
 
 
 def test_an_arm_that_begins_within_the_margin_of_a_range_only_leaves_it() -> None:
@@ -201,8 +203,6 @@ def test_an_arm_slows_down_and_ends_before_it_touches_itself() -> None:
     arm.settle(folded_rad, 8.0)
     assert arm.hits() & {"self_collision", "self"}, arm.hits()
     arm.assert_within_limits()
-    arm.settle(HOME_RAD, 8.0)
-    assert arm.joints_rad == pytest.approx(HOME_RAD, abs=EXACT_RAD)
 
 
 POST = {"centre_m": [0.3, 0.35, 0.3], "box_m": [0.1, 0.1, 0.8]}
@@ -261,7 +261,7 @@ def test_the_goal_stays_inside_the_box_when_the_leash_cuts_it_or_plans_are_avera
     low, high = workspace_corners(arm.profile.limits)
     rng, worst_m = np.random.default_rng(3), 0.0
     arm.activate()
-    for _ in range(40):
+    for _ in range(14):
         arm.send(*(rng.uniform(-0.3, 0.3, (1, 7)) * np.ones((8, 1))))
         for _ in range(40):
             arm.tick()
@@ -308,7 +308,7 @@ def test_a_joint_worker_that_takes_over_from_poses_moves_as_far_as_it_asks(
     swivel = np.linalg.svd(arm.kinematics.jacobian(start_rad))[2][-1]
     counts = range(1, 17) if relative_to == "start" else [1] * 16
     arm.send(*(0.06 * count * swivel for count in counts))
-    arm.run(3.5)
+    arm.run(2.5)
     np.testing.assert_allclose(arm.joints_rad, start_rad + 0.96 * swivel, atol=1e-4)
 
 

@@ -80,7 +80,7 @@ def test_commands_stay_inside_the_box_whenever_the_goal_changes() -> None:
     """The goals are inside; it is the way to them, and the stop, that could leave the box."""
     rng, path = np.random.default_rng(1), made_path()
     worst_m = 0.0
-    for _ in range(400):
+    for _ in range(120):
         asked = joint_goal(path.kinematics, HOME_RAD + rng.uniform(-1.0, 1.0, 7), 0.0)
         path.go_to(path.leash(asked, 0.0)[0])
         if rng.random() < 0.2:

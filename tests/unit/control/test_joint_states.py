@@ -57,7 +57,7 @@ def test_a_stop_brakes_the_joints_within_their_limits_and_latches() -> None:
 
 def test_joints_hold_when_no_chunk_comes_and_go_on_with_the_next_one() -> None:
     arm = moving()
-    arm.run(2.5)
+    arm.run(2.2)
     assert arm.rig.state == "holding"
     assert_stopped(arm)
     arm.settle(HOME_RAD + SIDEWAYS_RAD)
@@ -101,7 +101,7 @@ def test_a_blocked_arm_is_led_back_after_a_joint_action() -> None:
         if arm.rig.state != "active":
             break
     assert arm.rig.state == "inactive"
-    arm.run(4.0)
+    arm.run(2.5)
     assert "retreat" in {event.what for event in arm.rig.events}
     assert np.linalg.norm(arm.places_m[-1] - at_m) < 0.025
     assert joints_rad == pytest.approx(arm.joints_rad)
@@ -122,7 +122,7 @@ def test_a_load_on_the_tcp_ends_a_joint_motion() -> None:
     assert arm.rig.state == "inactive"
     assert "presses against the arm" in arm.rig.commander.why
     assert "contact_force" in arm.hits()
-    arm.run(4.0)
+    arm.run(2.0)
     assert arm.rig.commander.at_rest
 
 
@@ -138,8 +138,8 @@ def test_a_tcp_worker_takes_over_from_moving_joints_within_the_limits(
     arm.tick(Setting("worker", OTHER))
     assert arm.rig.commander.task.worker == OTHER
     begun = len(arm.places_m)
-    for _ in range(10):
-        step = [0.005, 0, 0, 0, 0, 0]
+    for _ in range(8):
+        step = [0.007, 0, 0, 0, 0, 0]
         arm.send(*[step] * 3, worker=OTHER, spec_hash=arm.rig.peers.specs[OTHER].hash)
         arm.run(0.3)
     arm.run(1.0)
@@ -161,7 +161,7 @@ def test_a_joint_worker_takes_over_from_a_moving_tcp_and_ends_where_it_asks(
     arm.tick(Setting("worker", OTHER))
     assert arm.rig.commander.task.worker == OTHER
     goal_rad = HOME_RAD + SIDEWAYS_RAD / 2
-    for _ in range(12):
+    for _ in range(8):
         arm.send(*[goal_rad] * 8, **other)
         arm.run(0.3)
     if command == "joint":

@@ -130,7 +130,7 @@ def test_an_arm_that_is_asked_for_nothing_keeps_its_elbow_unless_the_profile_say
         stage.restart(ELBOW_OUT_RAD)
         pose = KINEMATICS.forward(ELBOW_OUT_RAD)
         standing = Smoother(pose, TICK_S, motion_limits(of.limits))
-        for _ in range(500):
+        for _ in range(250):
             stage.tick(standing)
         moved_rad = np.abs(stage.position_rad - ELBOW_OUT_RAD).max()
         assert (moved_rad > 0.05) == moves

@@ -347,7 +347,7 @@ DELTAS = st.lists(
 )
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(DELTAS)
 def test_no_sequence_of_bounded_steps_leaves_the_bounds(
     deltas: list[tuple[tuple[float, ...], tuple[float, ...], int]],
@@ -366,7 +366,7 @@ def test_no_sequence_of_bounded_steps_leaves_the_bounds(
             assert hits or along_m == pytest.approx(far_m, rel=1e-6, abs=ROUNDING_M)
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.3),
     st.tuples(*[st.floats(-1, 1)] * 3),
@@ -387,7 +387,7 @@ def test_from_every_stop_the_way_back_is_open(
     assert angle_between(here.rotation, out.poses[0].rotation) < RETURNED_RAD
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.3),
     st.integers(0, 40),

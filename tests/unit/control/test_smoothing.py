@@ -66,7 +66,7 @@ def check_tick(before: Motion, now: Motion) -> None:
     assert (np.abs(now.twist - before.twist - quicker) <= SPEED_ATOL).all()
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(orders)
 def test_limits_hold_and_the_pose_is_the_integral_of_the_twist_whatever_is_ordered_when(
     given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | Shares | None]],
@@ -80,7 +80,7 @@ def test_limits_hold_and_the_pose_is_the_integral_of_the_twist_whatever_is_order
     assert motion.failures == 0
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @example([(3, (np.array([0.0, 0.0, 0.15]), np.array([0.0, 0.0, 0.6])))], (np.zeros(3), np.zeros(3)))
 @given(orders, targets)
 def test_it_ends_exactly_on_its_last_target(
@@ -101,7 +101,7 @@ def test_it_ends_exactly_on_its_last_target(
     assert angle_between(motion.motion.pose.rotation, goal.rotation) < AT_TARGET_RAD
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(orders)
 def test_a_brake_ends_where_it_was_foretold_and_stays_there(
     given_orders: list[tuple[int, tuple[np.ndarray, np.ndarray] | Shares | None]],
@@ -284,7 +284,7 @@ class Ends:
         )
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     st.lists(
         st.tuples(st.integers(3, 90), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), noises),
@@ -334,7 +334,7 @@ def brake_ranges(motion: Motion, axes: Callable[[], np.ndarray]) -> Iterator[np.
             yield stop_range(motion, float(share), np.eye(3)[axis])
 
 
-@settings(max_examples=120)
+@settings(max_examples=30)
 @given(st.lists(st.tuples(st.integers(1, 70), offsets), min_size=2, max_size=6))
 def test_a_retargeted_motion_stays_between_its_start_its_target_and_where_it_can_stop(
     retargets: list[tuple[int, np.ndarray]],
@@ -355,7 +355,7 @@ def test_a_retargeted_motion_stays_between_its_start_its_target_and_where_it_can
         assert not beyond().any()
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     offsets,
     offsets,

@@ -28,7 +28,7 @@ def moving_rig() -> Rig:
     return rig
 
 
-@pytest.mark.parametrize("minutes", [0.1, 9.0, 11.0])
+@pytest.mark.parametrize("minutes", [0.1, 11.0])
 def test_after_a_pause_the_rest_of_an_old_chunk_is_not_carried_out(minutes: float) -> None:
     rig = moving_rig()
     rig.put("speed", 0.0)
@@ -41,14 +41,14 @@ def test_after_a_pause_the_rest_of_an_old_chunk_is_not_carried_out(minutes: floa
     np.testing.assert_allclose(rig.position_m, stands_m, atol=SAME_M)
     assert rig.state == "active"
     rig.send([[0.0, 0, STEP_M, 0, 0, 0, 0]])
-    rig.run(6.0)
+    rig.run(1.5)
     np.testing.assert_allclose(rig.position_m - stands_m, [0, 0, STEP_M], atol=SAME_M)
 
 
 def test_after_a_pause_without_a_chunk_the_watchdog_brakes() -> None:
     rig = moving_rig()
     rig.put("speed", 0.0)
-    rig.run(30.0)
+    rig.run(5.0)
     assert rig.state == "active"
     rig.put("speed", 100.0)
     rig.run(2.0)
@@ -61,7 +61,7 @@ def test_a_plan_that_lasts_longer_than_any_record_of_overrides_never_goes_back()
     rig.run(0.2)
     start_m = rig.position_m.copy()
     rig.send(TEN_STEPS)
-    rig.run(7.0)
+    rig.run(2.0)
     gone_m = 0.0
     for percent in (5.0, 4.0, 3.0):
         rig.put("speed", percent)
@@ -81,7 +81,7 @@ def test_a_value_that_is_repeated_does_not_put_off_the_watchdog() -> None:
         rig.put("slower", 100.0)
         rig.run(0.2)
     assert rig.state == "holding"
-    for _ in range(30):
+    for _ in range(26):
         rig.put("speed", 100.0)
         rig.run(0.2)
     assert rig.state == "inactive"
@@ -139,7 +139,7 @@ def test_after_a_pause_joints_wait_for_a_new_chunk_as_poses_do(command: str) -> 
     arm.send(*(HOME_RAD + share * (goal_rad - HOME_RAD) for share in np.linspace(0, 1, 17)[1:]))
     arm.run(0.6)
     arm.tick(Setting("speed", 0.0))
-    arm.run(2.0)
+    arm.run(1.0)
     stands_m = arm.places_m[-1]
     assert 1e-3 < np.abs(arm.joints_rad - HOME_RAD).max() < 0.49
     arm.tick(Setting("speed", 100.0))
@@ -150,8 +150,7 @@ def test_after_a_pause_joints_wait_for_a_new_chunk_as_poses_do(command: str) -> 
     arm.settle(goal_rad)
 
 
-@pytest.mark.parametrize("percent", [50.0, 20.0, 5.0])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("percent", "seed"), [(50.0, 0), (20.0, 1), (5.0, 2)])
 def test_accelerations_are_those_of_the_override_however_goals_turn_and_move(
     percent: float, seed: int
 ) -> None:

@@ -126,9 +126,7 @@ def ready(rate_hz: float, horizon: int, dt_s: float, **action: str) -> Rig:
 @pytest.mark.parametrize(
     ("rate_hz", "horizon", "dt_s", "most"),
     [
-        (2.0, 1, 0.5, RIPPLE),
         (2.0, 4, 0.1, RIPPLE),
-        (2.0, 8, 0.5, RIPPLE),
         (5.0, 1, 0.2, RIPPLE),
         (5.0, 4, 0.1, RIPPLE),
         (10.0, 1, 0.1, UNEVEN_RIPPLE),
@@ -195,13 +193,13 @@ def apart_m(path: np.ndarray, other: np.ndarray) -> float:
     return worst
 
 
-@pytest.mark.parametrize("percent", [70.0, 20.0])
+@pytest.mark.parametrize("percent", [70.0, 40.0])
 def test_at_any_speed_the_path_is_the_same(percent: float) -> None:
     # A tick comes at another place of the path: goals change some millimetres apart at full speed.
     assert apart_m(path_at(percent)[:: round(100 / percent)], path_at(100.0)) < 1e-3
 
 
-@pytest.mark.parametrize(("horizon", "percent"), [(1, 100.0), (4, 50.0), (1, 25.0)])
+@pytest.mark.parametrize(("horizon", "percent"), [(1, 100.0), (4, 50.0)])
 def test_at_any_speed_the_steps_add_up_exactly(percent: float, horizon: int) -> None:
     rig = ready(5.0, horizon, 0.2)
     rig.put("speed", percent)
