@@ -136,7 +136,7 @@ def test_the_arm_does_not_move_when_joints_take_over_from_a_pose(
 ) -> None:
     world = make_world(friction_nm=friction_nm)
     start = world.hold_reference()
-    for reference in line(start, (0.1, 0.15, 0.2), 1.5):
+    for reference in line(start, (0.1, 0.15, 0.2), 0.8):
         world.tick(reference)
     hold(world, still(reference), waits_s)
     moved_m, moved_rad = moved_while(world, resting(world), 1.0)
@@ -149,7 +149,7 @@ def test_the_arm_does_not_move_when_a_pose_takes_over_from_joints(
     friction_nm: float, waits_s: float
 ) -> None:
     world = make_world(friction_nm=friction_nm)
-    reference, _ = follow_joints(world, swing(np.array(HOME_RAD), SWING_RAD, 1.5))
+    reference, _ = follow_joints(world, swing(np.array(HOME_RAD), SWING_RAD, 1.0))
     hold(world, reference, waits_s)
     moved_m, moved_rad = moved_while(world, world.hold_reference(), 1.0)
     assert moved_m < CHANGE_LIMIT_M
@@ -181,9 +181,9 @@ def test_a_load_is_carried_on_by_the_law_that_takes_over(first: str) -> None:
 
 def test_the_elbow_stays_where_joints_left_it_until_a_reset() -> None:
     world = make_world()
-    reference, _ = follow_joints(world, swing(np.array(HOME_RAD), SWING_RAD, 1.5))
+    reference, _ = follow_joints(world, swing(np.array(HOME_RAD), SWING_RAD, 1.0))
     hold(world, reference, 0.5)
-    hold(world, world.hold_reference(), 2.0)
+    hold(world, world.hold_reference(), 1.0)
     turned = world.joint_state().position_rad - reference.position_rad
     assert np.abs(turned).max() < CHANGE_LIMIT_RAD
     world.reset()

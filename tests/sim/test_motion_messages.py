@@ -107,6 +107,7 @@ def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm() -> None
     check_motion(loop)
 
 
+@pytest.mark.long
 def test_chunks_from_the_future_are_nothing_and_the_arm_stops() -> None:
     loop = moving()
     since = mark(loop)

@@ -22,7 +22,7 @@ from vla_zenoh.types import FloatArray
 STEPS = 2
 WAY_M = STEPS * 0.01
 EXACT_M = 5e-4
-SECONDS = 1.4
+SECONDS = 1.0
 """For the steps at 5 Hz, and to stand again."""
 FOLLOWS = "which the description lets follow a joint of the arm (mimic)"
 

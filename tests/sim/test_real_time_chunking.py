@@ -54,7 +54,7 @@ def jumps_m(*, takes_committed: bool) -> np.ndarray:
     )
     loop.put("rate", RATE_HZ)
     loop.put("prompt", "pass")
-    loop.run(1.0)
+    loop.run(0.5)
     loop.put("active", True)
     loop.run(RUN_S)
     goals = [command.goal_position_m for command in loop.trace.commands if command is not None]
