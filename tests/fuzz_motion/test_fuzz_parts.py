@@ -7,6 +7,7 @@ from fuzz_parts import TOLERANCE_M, least_m
 from pair_rig import shipped
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "ticks"),
     [
