@@ -197,7 +197,7 @@ def read(policy: Policy, prompt: str) -> str:
 @pytest.mark.parametrize(
     ("name", "count", "right", "wrong"),
     [
-        ("held_out.txt", 300, 0.95, 0.01),
+        pytest.param("held_out.txt", 300, 0.95, 0.01, marks=pytest.mark.long),
         ("final.txt", 60, 0.9, 0.02),
         ("independent.txt", 60, 0.95, 0.0),
     ],
@@ -217,7 +217,7 @@ def test_free_wordings_that_were_never_taught_are_read(
 @pytest.mark.parametrize(
     ("name", "count", "still"),
     [
-        ("held_out_no_task.txt", 160, 0.98),
+        pytest.param("held_out_no_task.txt", 160, 0.98, marks=pytest.mark.long),
         ("final_no_task.txt", 40, 0.9),
         ("independent_no_task.txt", 47, 1.0),
     ],

@@ -28,6 +28,8 @@ from vla_zenoh.simulation.world import World
 from vla_zenoh.types import PoseReference
 
 REACHED_M, OFF_AXIS_M, DRIFT_RAD = 1e-3, 1e-3, 2e-3
+DIRECTION_M = 4e-4
+"""Of a way of 0.03 m."""
 TURNED_RAD = 2e-3
 WITH_FRICTION_M = 2e-3
 FRICTION_NM = 0.5
@@ -184,7 +186,7 @@ def test_every_direction_is_exact_and_moves_nothing_else() -> None:
     for axis, name in enumerate("xyz"):
         for sign in (1, -1):
             run = carry_out(loop, f"{'+' if sign > 0 else '-'}{name}", 3)
-            check_translation(run, axis, sign * 0.03)
+            check_translation(run, axis, sign * 0.03, DIRECTION_M)
             assert norm3(run.turned_rad) < DRIFT_RAD
     check_stream(loop)
 

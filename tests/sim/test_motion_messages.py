@@ -83,7 +83,7 @@ def test_chunks_that_are_too_late_are_nothing_and_the_arm_stops() -> None:
     loop = moving()
     since = mark(loop)
     loop.tamper = delayed(1.2, ActionChunk)
-    loop.run(2.0)
+    loop.run(1.9)
     assert loop.refused["stale"] > 5
     check_stop(loop, since, STARVED)
     check_motion(loop)
@@ -100,7 +100,7 @@ def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm() -> None
 
     loop = moving()
     loop.tamper = repeated
-    loop.run(2.0)
+    loop.run(1.7)
     (event,) = [event for event in loop.events if event.what == "same_image"]
     assert "while the arm moves" in event.why
     assert speed_m_s(loop)[-1] < STILL_M_S
