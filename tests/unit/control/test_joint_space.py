@@ -9,6 +9,7 @@ import pytest
 from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
+from vla_zenoh.control.axis_smoothing import AxisState
 from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.joint_space import STEP_HALVINGS, JointBounds, JointPath
 from vla_zenoh.control.limits import (
@@ -88,6 +89,31 @@ def test_commands_stay_inside_the_box_whenever_the_goal_changes() -> None:
         for _ in range(int(rng.integers(1, 60))):
             worst_m = max(worst_m, outside_m(path.tick().pose.position_m))
     assert worst_m < OUTSIDE_M
+
+
+ALONG_A_FACE = AxisState(
+    np.array([-2.0567, -0.618, 1.0799, -2.7307, 0.4957, 3.0595, 0.5071]),
+    np.array([-0.1006, 0.0381, 0.2138, -0.0404, 0.312, 0.0361, -0.1625]),
+    np.array([0.4172, -0.3385, 1.1917, 0.8087, 1.7875, -1.5966, 0.2551]),
+)
+"""A micrometre outside the box, and faster all the time."""
+GOAL_RAD = np.array([-2.2119, -0.5585, 1.4566, -2.7785, 1.0133, 3.0973, 0.2508])
+GOAL_RAD_A_TICK = np.array([-0.00188, 0.00077, 0.00474, -0.00024, 0.00626, 0.00026, -0.00321])
+
+
+def test_commands_that_curve_along_a_face_do_not_creep_through_it() -> None:
+    """Every tick's stop would end no further outside than that tick began."""
+    path = made_path()
+    path.stand(ALONG_A_FACE.position)
+    path.state = ALONG_A_FACE
+    worst_m, hits = 0.0, 0
+    for tick in range(60):
+        goal = joint_goal(path.kinematics, GOAL_RAD + tick * GOAL_RAD_A_TICK, 0.0)
+        path.go_to(goal, path.shares(goal))
+        worst_m = max(worst_m, outside_m(path.tick().pose.position_m))
+        hits += len(path.taken_hits())
+    assert worst_m < OUTSIDE_M
+    assert hits > 0
 
 
 def test_a_stop_passes_no_joint_s_targets() -> None:
