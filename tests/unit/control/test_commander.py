@@ -745,7 +745,8 @@ def test_why_an_arm_stopped_by_itself_is_said_when_it_is_activated_again() -> No
 
 def stuck_rig() -> Rig:
     """Just stopped, because the joints cannot follow."""
-    of = override(load_profile("panda_sim"), {"robot": {"command": "joint", "posture": "home"}})
+    changes = {"robot": {"command": "joint", "posture": "home"}, "timing": {"command_hz": 100}}
+    of = override(load_profile("panda_sim"), changes)
     reach, rng = reach_of(of), np.random.default_rng(0)
     kinematics = reach.kinematics
     rig = Rig(of, reach=reach)
@@ -756,7 +757,7 @@ def stuck_rig() -> Rig:
         step = step + 0.5 * rng.normal(size=6)
         way = np.clip(step, -1, 1) * [0.03, 0.03, 0.03, 0.15, 0.15, 0.15]
         rig.send([[*way, 0.0]] * 8)
-        for _ in range(50):
+        for _ in range(20):
             out = rig.tick()
             if out.joint is not None:
                 rig.stand_at(kinematics, out.joint.position_rad)

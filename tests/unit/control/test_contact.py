@@ -122,7 +122,7 @@ def test_what_was_there_when_it_was_activated_is_no_contact_up_to_slow() -> None
 
 def test_a_load_that_is_taken_up_is_got_used_to_but_no_more_than_slow() -> None:
     arm = active()
-    arm.feels(0.0, 0.0, -0.8 * LIMITS.force_slow_n, s=5 * DRIFT_S)
+    arm.feels(0.0, 0.0, -0.8 * LIMITS.force_slow_n, s=3 * DRIFT_S)
     assert arm.contact.quiet
     pushed = active()
     pushed.feels(LIMITS.force_stop_n - 1.0, 0.0, 0.0, s=5 * DRIFT_S)

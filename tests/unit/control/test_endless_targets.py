@@ -19,6 +19,7 @@ from vla_zenoh.policy.meaning import wrapped
 HOME = np.array(HOME_RAD)
 TURN = 2 * math.pi
 EXACT = 1e-5
+SELDOM = {"command_hz": 100}
 FLANGE = np.array([0, 0, 0, 0, 0, 1.0])
 
 
@@ -41,7 +42,7 @@ def steady(arm: Joints) -> bool:
 
 @pytest.mark.parametrize("said", ["wrapped", "counted"])
 def test_targets_are_gone_to_over_many_turns_however_they_are_said(folder: Path, said: str) -> None:
-    arm = Joints(endless_arm(folder), turns=said)
+    arm = Joints(endless_arm(folder, timing=SELDOM), turns=said)
     arm.activate()
     path = HOME + np.linspace(0, 1.2 * TURN, 110)[:, None] * FLANGE  # past pi twice
     arm.follow(path)
@@ -53,7 +54,7 @@ def test_targets_are_gone_to_over_many_turns_however_they_are_said(folder: Path,
 
 
 def test_deltas_add_up_over_many_turns(folder: Path) -> None:
-    arm = Joints(endless_arm(folder), kind="delta")
+    arm = Joints(endless_arm(folder, timing=SELDOM), kind="delta")
     arm.activate()
     for _ in range(10):
         arm.send(*[list(0.08 * FLANGE)] * 8)

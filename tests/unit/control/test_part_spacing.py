@@ -103,8 +103,8 @@ def test_measured_arms_are_looked_at_once_a_period() -> None:
 @pytest.mark.parametrize("share_s", [2e-3, 2e-2, 0.2])
 def test_arms_stand_before_their_stop_however_slowly_they_come_nearer(share_s: float) -> None:
     """Both lean towards each other, by a share of `LEAN` a second, and brake at once."""
-    arms, tick_s, share = Arms(), 0.004, 1.525
-    for number in range(round(0.03 / share_s / tick_s)):
+    arms, tick_s, share = Arms(), 0.004, 1.54
+    for number in range(round(0.015 / share_s / tick_s)):
         ahead = leaning(share + 2 * tick_s * share_s)
         for part in arms.parts:
             part.motion = SimpleNamespace(

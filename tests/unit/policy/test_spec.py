@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 from random_records import model_specs
@@ -170,6 +170,7 @@ def test_another_picture_has_another_hash(change: dict[str, Any]) -> None:
     assert ModelSpec.from_dict(replaced(SPEC.to_dict(), place, [camera])).hash != SPEC.hash
 
 
+@settings(max_examples=30)
 @given(model_specs, model_specs)
 def test_the_hash_differs_exactly_where_specs_differ(one: ModelSpec, other: ModelSpec) -> None:
     assert (one.hash == other.hash) == (one == other)
@@ -180,6 +181,7 @@ def test_zero_is_zero_whatever_its_sign() -> None:
     assert len({ModelSpec(name="x", action=spec).hash for spec in specs}) == 1
 
 
+@settings(max_examples=30)
 @given(model_specs)
 def test_a_spec_comes_back_from_plain_data(spec: ModelSpec) -> None:
     back = ModelSpec.from_dict(json.loads(json.dumps(spec.to_dict())))
@@ -332,6 +334,7 @@ def holds(spec: ModelSpec, observation: Observation) -> bool:
     )
 
 
+@settings(max_examples=30)
 @given(model_specs)
 def test_an_example_is_what_the_spec_asks_for(spec: ModelSpec) -> None:
     assume(len(spec.name) <= 128)
