@@ -41,8 +41,6 @@ COMMANDS = (
     "put the red brick in the box",
     "stack the blue brick on the green brick",
     "push the yellow brick to the left",
-    "push the green brick away",
-    "slide the red brick closer to you",
 )
 ORDERS = (
     Order("put", "green"),
@@ -248,9 +246,7 @@ def test_a_demo_judges_free_wording_by_the_goal_that_was_read() -> None:
     assert second.draw(nowhere, held_out=False).order == Order("stay")
 
 
-@pytest.mark.parametrize(
-    "command", [*COMMANDS[:3], *(pytest.param(c, marks=pytest.mark.long) for c in COMMANDS[3:])]
-)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_a_negated_command_is_never_obeyed(policy: Policy, command: str) -> None:
     negated = [form.format(command) for form in held_out("negated.txt")]
     negated += [form.replace("'", "\u2019").format(command) for form in held_out("negated.txt")]

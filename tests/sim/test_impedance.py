@@ -14,6 +14,7 @@ FOLLOW_LIMIT_RAD = 5e-3
 FRICTION_NM = 0.5
 FRICTION_LIMIT_M = 5e-4
 SETTLE_S = 3.0
+ASIDE_M = (0.1, -0.2, -0.05)
 REST_LIMIT_M = 2e-5
 PRESS_SLACK_N = 0.5
 PRESS_MOVING_N = 10.0  # what a reference that still moves adds through the damping
@@ -38,23 +39,16 @@ def test_a_turning_circle_is_followed_within_a_millimetre(gains: ImpedanceGains)
     assert np.linalg.norm(world.tcp()[0] - start.position_m) < REST_LIMIT_M
 
 
-@pytest.mark.parametrize(
-    "by_m",
-    [
-        (0.1, -0.2, -0.05),
-        *(pytest.param(by, marks=pytest.mark.long) for by in ((0.0, 0.0, 0.5), (0.1, 0.15, 0.1))),
-    ],
-)
-def test_integral_action_overcomes_joint_friction(by_m: tuple[float, float, float]) -> None:
+def test_integral_action_overcomes_joint_friction() -> None:
     world = make_world(friction_nm=FRICTION_NM)
-    reference, _, _ = follow(world, line(world.hold_reference(), by_m, 1.0))
+    reference, _, _ = follow(world, line(world.hold_reference(), ASIDE_M, 1.0))
     wait(world, reference, SETTLE_S)
     assert np.linalg.norm(world.tcp()[0] - reference.position_m) < FRICTION_LIMIT_M
 
 
 def test_without_integral_action_friction_leaves_a_larger_error() -> None:
     world = make_world(ImpedanceGains(integral_1_s=0.0), friction_nm=FRICTION_NM)
-    reference, _, _ = follow(world, line(world.hold_reference(), (0.1, -0.2, -0.05), 1.0))
+    reference, _, _ = follow(world, line(world.hold_reference(), ASIDE_M, 1.0))
     wait(world, reference, SETTLE_S)
     assert np.linalg.norm(world.tcp()[0] - reference.position_m) > 2 * FRICTION_LIMIT_M
 
