@@ -136,7 +136,7 @@ def test_the_arm_does_not_move_when_joints_take_over_from_a_pose(
 ) -> None:
     world = make_world(friction_nm=friction_nm)
     start = world.hold_reference()
-    for reference in line(start, (0.1, 0.15, 0.2), 0.8):
+    for reference in line(start, (0.1, 0.15, 0.2), 1.5):
         world.tick(reference)
     hold(world, still(reference), waits_s)
     moved_m, moved_rad = moved_while(world, resting(world), 1.0)
