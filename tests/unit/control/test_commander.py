@@ -412,11 +412,13 @@ def test_without_fresh_chunks_it_brakes_holds_and_goes_on_with_the_next_one() ->
     waited_s = (rig.now_ns - began_ns) / 1e9
     assert watchdog_s < waited_s < watchdog_s + 1 / rig.commander.task.rate_hz + 0.1 + 0.01
     rig.run(1.0)
+    assert rig.commander.at_rest
     assert rig.state == "holding"
     at_m = rig.position_m[0]
     rig.send([FORTH])
     assert rig.state == "active"
-    rig.settle()
+    rig.run(1.5)
+    assert rig.commander.at_rest
     assert rig.position_m[0] == pytest.approx(at_m + 0.02, abs=1e-4)
     assert rig.transitions[-3:-1] == ["active->holding", "holding->active"]
     rig.assert_smooth()
