@@ -14,7 +14,7 @@ from mutants import ROOT, reviewed
 from mutations import Mutant, draw, mutants_of
 
 LIMIT_S = 120
-GRACE_S = 3  # of a mutant that hangs
+GRACE_S = 6  # of a mutant that hangs; a busy computer takes seconds to begin the others
 
 MADE = '''
 """Tells whether something is > 1."""
