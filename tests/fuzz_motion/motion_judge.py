@@ -352,12 +352,7 @@ class Judge:
         self._tell("a rotation at its goal wanders", away, WANDER_RAD, "mrad", 1e3)
 
     def _ways(self, twist: Array, acceleration: Array) -> None:
-        """Every axis stays between its start, its goal and where a brake would have ended.
-
-        With the limits of the profile and the speed override: what slower joints leave of them, as
-        in the family of joints as poses, is not known here. An axis that then goes past its goal
-        for want of jerk, and comes back, is told (seed 2000218, 0.07 mm).
-        """
+        """Every axis stays between its start, its goal and where a brake would have ended."""
         goal_m, goal_rotation = self._goal_arrays()
         usable = self._active & np.append(False, self._goes_on)
         usable &= np.append(False, self._active[:-1])

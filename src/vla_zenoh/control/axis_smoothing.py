@@ -17,10 +17,11 @@ Limits are (3, n): velocity, acceleration and jerk of every axis, per second, s^
     limits       the shares asked for, and as much jerk as ends each acceleration before its axis
                  exceeds the velocity limit: jerk >= a^2 / (2 (v_max - |v|))
     unreversed   and as much as ends a deceleration before its axis reverses: jerk >= a^2 / (2 |v|)
+    kept         and as much as the motion in progress was planned with, to stop where that would
     hardest      velocity of `limits`, acceleration and jerk of the box
 
-A motion is planned with the first of the last three that takes no detour, each in up to three ways
-(`_WAYS`): nine plans at most, one as a rule. If all of them take one, one of the hardest is
+A motion is planned with the first of the last four that takes no detour, each in up to three ways
+(`_WAYS`): twelve plans at most, one as a rule. If all of them take one, one of the hardest is
 executed: a detour within the limits is better than no plan.
 
 A plan with shares s, s^2, s^3 of the box is the same motion in 1/s of the time. Ruckig, which
@@ -32,7 +33,8 @@ states", RSS 2021.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,6 +157,8 @@ class AxisSmoother:
         self._plan: AxisPlan | None = None
         self._elapsed_s = 0.0
         self._jerk, self._sign = zeros, zeros
+        self._planned_jerk = zeros
+        """(n,) jerk limits that the motion in progress was planned with."""
         self._time_scale = 1.0
         self._again: tuple[Shares, bool] | None = None
         self._too_fast = zeros > 0.0
@@ -206,7 +210,7 @@ class AxisSmoother:
             return
         self._settle(FULL)
         limits = self.box if shares is None else self._limits(shares)[1]
-        self._again, self.braking = None, True
+        self._again, self.braking, self._planned_jerk = None, True, limits[2]
         self._begin(self._stop(limits, together=shares is not None), shares or FULL)
 
     # -- planning -----------------------------------------------------------------------------
@@ -239,13 +243,15 @@ class AxisSmoother:
             return None, False
         basis, parts = self._coordinates(way, limits)
         plan: AxisPlan | None = None
+        kept = np.array([*unreversed[:2], np.maximum(unreversed[2], self._planned_jerk)])
         hardest = np.concatenate([limits[:1], self.box[1:]])
         attempts = [limits]
-        attempts += [unreversed] * bool((limits < unreversed).any())
-        attempts += [hardest] * bool((unreversed < hardest).any())
+        for more in (unreversed, kept, hardest):
+            attempts += [more] * bool((attempts[-1] < more).any())
+        self._planned_jerk = attempts[-1][2]
         along = basis.T @ way
         for most in attempts:
-            may_take = hardest if all_to_stop or most is hardest else unreversed
+            may_take = hardest if all_to_stop or most is hardest else kept
             for synchronization, slowly in _WAYS:
                 ask = self._input(basis, most, parts, slowly=slowly)
                 ask.target_position = along.tolist()
@@ -261,7 +267,8 @@ class AxisSmoother:
                 if not (self._overshoots(path, along, stop) or self._leaves(found)):
                     if most is not limits:
                         self._jerk = most[2] / self.box[2]
-                    return found, most is not hardest
+                    self._planned_jerk = most[2]
+                    return found, most is limits or most is unreversed
                 plan = plan if slowly and plan is not None else found
         return plan, False
 
@@ -526,6 +533,39 @@ def line_of(
 
 
 def _extrema(path: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """(k,) least and greatest positions."""
-    low, high = np.array([(one.min, one.max) for one in path.position_extrema]).T
+    """(k,) least and greatest positions.
+
+    Ruckig's own ``position_extrema`` misses what is reached while the acceleration is constant
+    (pantor/ruckig, issue 215).
+    """
+    bounds = [_bounds(profile) for profile in path.profiles[0]]
+    low, high = np.array(bounds).T
     return low, high
+
+
+def _bounds(profile: Any) -> tuple[float, float]:
+    """Least and greatest position of one axis: at the ends of its phases, or where it reverses."""
+    reached = profile.p[-1:]
+    for part in (profile.brake, profile):  # what comes before the seven phases, and these
+        for phase in zip(part.t, part.j, part.a, part.v, part.p, strict=False):
+            reached += _reached(*phase)
+    return min(reached), max(reached)
+
+
+def _reached(time_s: float, jerk: float, a: float, v: float, start: float) -> list[float]:
+    """Where a phase of constant jerk starts, and where its velocity is zero."""
+    if time_s <= 0.0:
+        return []
+    inside = a * a - 2 * jerk * v
+    if jerk == 0.0:
+        turns_s = [-v / a] if a else []
+    elif inside < 0.0:
+        turns_s = []
+    else:
+        root = math.sqrt(inside)
+        turns_s = [(-a - root) / jerk, (-a + root) / jerk]
+    return [start] + [
+        start + turn_s * (v + turn_s * (0.5 * a + turn_s * jerk / 6))
+        for turn_s in turns_s
+        if 0.0 < turn_s < time_s
+    ]
