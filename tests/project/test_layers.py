@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from imports_in import imports_in
 
 import vla_zenoh
 from vla_zenoh import control
@@ -85,18 +86,12 @@ def allowed(path: Path) -> frozenset[str]:
 
 
 @cache
-def walked(source: str) -> tuple[ast.AST, ...]:
-    return tuple(ast.walk(ast.parse(source)))
-
-
-def imported_names(source: str) -> set[str]:
+def imported_names(source: str) -> frozenset[str]:
     names: set[str] = set()
-    for node in walked(source):
-        if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            names.update(f"{node.module}.{alias.name}" for alias in node.names)
-    return names
+    for node in imports_in(source):
+        before = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
+        names.update(f"{before}{alias.name}" for alias in node.names)
+    return frozenset(names)
 
 
 def offences(source: str, forbidden: frozenset[str]) -> list[str]:
@@ -113,7 +108,7 @@ def test_where_the_tcp_may_be_is_read_in_one_place() -> None:
         path.name
         for path in (*PACKAGE.rglob("*.py"), *(ROOT / "plugins").rglob("*.py"))
         if "limits.workspace" in (source := path.read_text())
-        for node in walked(source)
+        for node in ast.walk(ast.parse(source))
         if isinstance(node, ast.Attribute) and ast.unparse(node).endswith("limits.workspace")
     }
     assert readers == set()
@@ -156,7 +151,7 @@ def names_of_the_lab(source: str) -> set[str]:
     """Modules of the lab that a file imports, or names in a string for a later import."""
     texts = {
         node.value
-        for node in walked(source)
+        for node in (ast.walk(ast.parse(source)) if "lab." in source else ())
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
     return {name for name in texts | imported_names(source) if OF_THE_LAB.fullmatch(name)}

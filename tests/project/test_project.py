@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from imports_in import imports_in
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ["benchmarks", "examples", "models", "plugins", "reliability", "scripts", "sim", "tests"]
@@ -91,16 +92,14 @@ def test_what_is_imported_from_the_package_is_there() -> None:
     wrong = []
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
-                    "vla_zenoh."
-                ):
-                    assert node.module
-                    wrong += [
-                        f"{path.relative_to(ROOT)}:{node.lineno}: {node.module}.{alias.name}"
-                        for alias in node.names
-                        if not is_there(node.module, alias.name)
-                    ]
+            wrong += [
+                f"{path.relative_to(ROOT)}:{node.lineno}: {node.module}.{alias.name}"
+                for node in imports_in(path.read_text())
+                if isinstance(node, ast.ImportFrom)
+                if node.module and node.module.startswith("vla_zenoh.")
+                for alias in node.names
+                if not is_there(node.module, alias.name)
+            ]
     assert not wrong, wrong
 
 

@@ -125,9 +125,9 @@ ANGLES = re.compile(
 def subtracts_joints(node: ast.AST) -> bool:
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
         return all(ANGLES.search(ast.unparse(side)) for side in (node.left, node.right))
-    return isinstance(node, ast.Call) and bool(
-        re.match(r"np\.diff\((steps|joints|rows_rad|ways)\b", ast.unparse(node))
-    )
+    if not isinstance(node, ast.Call) or getattr(node.func, "attr", "") != "diff":
+        return False
+    return bool(re.match(r"np\.diff\((steps|joints|rows_rad|ways)\b", ast.unparse(node)))
 
 
 def test_every_file_that_subtracts_angles_of_joints_is_right_over_half_a_turn() -> None:
