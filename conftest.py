@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import tomllib
@@ -14,6 +15,7 @@ from typing import Any
 import pytest
 from chain import CHAIN_PATIENCE_S, Chain, running_chain
 from hypothesis import settings
+from yaml_once import remember_yaml
 
 # Machines that run tests are slow now and then: time per example says nothing about the code. The
 # same examples every time, so that a failure is that of the change; new ones are searched for by
@@ -76,7 +78,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return ByFile(config, log)
 
 
+def pytest_collection() -> None:
+    """What is imported stays; to look through it for rubbish takes a quarter of the time."""
+    gc.disable()
+    remember_yaml()
+
+
 def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
     if "vla_zenoh.kinematics.collision" in sys.modules:
         from collision_once import remember_distances
 
