@@ -7,7 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_rig import DOWN, START_M, START_NS, Rig, lone_chunk, model_spec, profile, quat_of
+from command_rig import (
+    DOWN,
+    OFTEN,
+    START_M,
+    START_NS,
+    Rig,
+    lone_chunk,
+    model_spec,
+    profile,
+    quat_of,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from panda_arm import panda, tool_down_at
@@ -127,7 +137,7 @@ def test_absolute_targets_behind_a_limit_do_not_wander_with_what_it_cut() -> Non
 # -- the budget -----------------------------------------------------------------------------------
 @pytest.mark.parametrize("mode", ["replace", "blend", "ensemble"])
 def test_no_tick_evaluates_the_arm_more_often_than_its_budget_allows(mode: str) -> None:
-    rig = arm_rig(profile(composition={"mode": mode}))
+    rig = arm_rig(profile(composition={"mode": mode}, timing=OFTEN))
     budget = rig.commander._planner.budget
     assert budget <= 10
     most = total = 0
@@ -155,7 +165,7 @@ def test_in_free_space_a_chunk_is_in_force_in_the_tick_in_which_it_came(late_s: 
 
 
 def test_until_a_chunk_is_bounded_the_one_before_it_stays_in_force() -> None:
-    rig = arm_rig()
+    rig = arm_rig(profile(timing=OFTEN))
     rig.run(0.3)
     first = rig.send([UP] * 16).accepted
     assert first is not None
@@ -174,7 +184,7 @@ def test_until_a_chunk_is_bounded_the_one_before_it_stays_in_force() -> None:
 
 
 def test_chunks_that_come_while_another_is_bounded_lose_no_step() -> None:
-    rig = arm_rig(dt_s=0.02)
+    rig = arm_rig(profile(timing=OFTEN), dt_s=0.02)
     rig.run(0.4)
     asked, up = 0.0, [0.0, 0.0, 0.004, 0.0, 0.0, 0.0, 0.0]
     for _ in range(2):
@@ -237,7 +247,7 @@ def test_a_chunk_that_is_not_in_force_yet_never_will_be_after_a_stop_or_another_
 def test_a_profile_that_refuses_what_is_out_of_bounds_decides_when_all_of_it_is_known(
     count: int, refused: dict[str, int]
 ) -> None:
-    rig = arm_rig(profile(limits={"out_of_bounds": "refuse"}))
+    rig = arm_rig(profile(limits={"out_of_bounds": "refuse"}, timing=OFTEN))
     IN_PIECES.count = 0
     out = rig.send([[0, 0, -0.01, 0, 0, 0, 0]] * count)
     assert out.accepted is None

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from command_rig import (
     MS,
+    OFTEN,
     OTHER,
     SOURCE,
     START_M,
@@ -92,7 +93,7 @@ def test_activation_begins_where_the_robot_holds_and_does_not_move_it() -> None:
     rig = Rig()
     rig.activate()
     rig.run(0.5)
-    assert len(rig.commands) > 100
+    assert len(rig.commands) > 0.4 * rig.profile.timing.command_hz
     for command in rig.commands:
         np.testing.assert_allclose(command.position_m, START_M, atol=1e-12)
     assert rig.widths_m == []
@@ -295,7 +296,7 @@ def test_overlapping_chunks_give_the_speed_that_was_asked_for(period_s: float) -
     asked_s = 2.08
     for _ in range(round(asked_s / period_s)):
         rig.send([UP] * 10)
-        rig.run(period_s - 0.004)
+        rig.run(period_s - rig.period_ns / 1e9)
     goal = rig.commander.parts[0].motion.goal
     assert goal is not None
     spent_s = round(asked_s / period_s) * period_s
@@ -673,7 +674,7 @@ def test_a_worker_that_was_started_anew_has_to_be_activated_anew() -> None:
 
 
 def test_robot_state_that_falls_silent_ends_the_activation() -> None:
-    rig = moving_rig()
+    rig = moving_rig(of=profile(timing=OFTEN))
     rig.silent = True
     began_ns = rig.now_ns
     while rig.state == "active":

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from command_rig import OFTEN
 from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
@@ -31,7 +32,7 @@ PASSED_RAD = 1e-6
 
 
 def made_path() -> JointPath:
-    profile = panda()
+    profile = panda(timing=OFTEN)
     reach = ReachabilityFilter(profile)
     path = JointPath(profile, JointBounds(profile, reach.kinematics, reach.barriers))
     path.stand(HOME_RAD)
@@ -248,7 +249,7 @@ def test_a_far_target_is_approached_no_faster_than_the_limit_along_the_whole_cur
 
 def test_joints_that_brake_pass_and_end_where_they_were_said_to() -> None:
     rng, path = np.random.default_rng(3), made_path()
-    dt_s, moved_rad = 1.0 / panda().timing.command_hz, 0.0
+    dt_s, moved_rad = 1.0 / OFTEN["command_hz"], 0.0
     for _ in range(100):
         target = HOME_RAD + 0.6 - rng.choice([0.0, 0.0, 0.3, 1.2], 7) * rng.random(7)
         path.move_to(target)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from command_rig import MS, START_NS, Rig
+from command_rig import MS, OFTEN, START_NS, Rig, profile
 
 from vla_zenoh.control.lateness import WINDOW_S, Lateness
 
 
 def test_a_loss_after_late_ticks_says_how_late_they_were() -> None:
-    rig = Rig()
+    rig = Rig(profile(timing=OFTEN))
     rig.activate()
     rig.silent = True
     late = round(0.08 * rig.profile.timing.command_hz)

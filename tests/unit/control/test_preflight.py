@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_rig import MS, START_NS, WORKER, Rig, model_spec
+from command_rig import MS, OFTEN, START_NS, WORKER, Rig, model_spec, profile
 
 from vla_zenoh.control.limits import BEGIN_M
 from vla_zenoh.control.policy_check import wrong_rate
@@ -34,7 +34,7 @@ class Ready:
     """Everything as it has to be; a test breaks one thing."""
 
     def __init__(self) -> None:
-        rig = Rig()
+        rig = Rig(profile(timing=OFTEN))
         self.profile, self.peers = rig.profile, rig.peers
         self.worker, self.prompt, self.rate_hz = WORKER, "hold", 5.0
         self.pose, self.gripper = rig.pose_state(), rig.gripper_state()

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_rig import MS, START_M, Rig
+from command_rig import MS, OFTEN, START_M, Rig, profile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -33,7 +33,7 @@ class Walled(Rig):
     """
 
     def __init__(self, along: np.ndarray, gap_m: float, *, told: bool = True) -> None:
-        super().__init__()
+        super().__init__(profile(timing=OFTEN))
         self.along = along / np.linalg.norm(along)
         self.gap_m, self.told = gap_m, told
         self.moved_by_person_m = np.zeros(3)
@@ -467,7 +467,7 @@ def test_a_watch_says_which_state_is_missing() -> None:
 
 
 def test_a_single_false_pose_of_an_arm_without_kinematics_is_forgotten_when_it_is_back() -> None:
-    rig = Rig()
+    rig = Rig(profile(timing=OFTEN))
     rig.activate()
     states, here_m = rig.commander.parts[0].states, rig.position_m
     rig.position_m = here_m + np.array([0.03, 0, 0])
@@ -494,7 +494,7 @@ def test_an_arm_that_is_pushed_is_no_false_pose_unless_nobody_pushes_so_fast(
 
 
 def test_a_pose_that_jumped_and_stays_there_is_not_trusted_without_kinematics() -> None:
-    rig = Rig()
+    rig = Rig(profile(timing=OFTEN))
     rig.activate()
     rig.position_m = rig.position_m + np.array([0.03, 0, 0])
     rig.blocked = True  # it stays there

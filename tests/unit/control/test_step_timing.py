@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from command_rig import MS, Rig, profile
+from command_rig import MS, OFTEN, Rig, profile
 
 from vla_zenoh.control.limits import motion_limits
 from vla_zenoh.control.plan_timeline import Goal, Plan
@@ -170,7 +170,7 @@ def curve() -> list[list[float]]:
 @cache
 def path_at(percent: float) -> np.ndarray:
     """Positions (n, 3) m of the commands that carry the curve out."""
-    timing = {"max_open_loop_s": 60.0, "watchdog_s": 5.0, "max_observation_age_s": 10.0}
+    timing = {"max_open_loop_s": 60.0, "watchdog_s": 5.0, "max_observation_age_s": 10.0, **OFTEN}
     rig = Rig(profile(timing=timing), horizon=12, dt_s=0.1)
     rig.activate()
     rig.put("speed", percent)
