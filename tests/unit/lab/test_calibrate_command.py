@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,6 +37,7 @@ LENS = Intrinsics(width=WIDTH, height=HEIGHT, fx_px=FOCAL_PX, fy_px=FOCAL_PX, cx
 CAMERA = placed(exp3(np.array([0.1, -0.2, 1.5])), np.array([0.06, 0.01, -0.08]))
 """In the TCP: it looks along its z, as the TCP's."""
 VIEWS = 16
+LONG = pytest.mark.long
 ZERO_NS = 1_700_000_000_000_000_000
 PROFILE = """\
 # of our lab
@@ -114,6 +117,22 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True, scope="module")
+def found_once() -> Iterator[None]:
+    """The board in each image of the recording, which many tests read."""
+    find, found = Board.find, dict[tuple[Board, bytes], Any]()
+
+    def remembered(board: Board, grey: Any) -> Any:
+        asked = board, grey.tobytes()
+        if asked not in found:
+            found[asked] = find(board, grey)
+        return found[asked]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Board, "find", remembered)
+        yield
+
+
 def run(*words: object) -> Result:
     return CliRunner().invoke(app, ["camera", *map(str, words)])
 
@@ -190,8 +209,8 @@ def test_the_lens_alone_needs_no_arm(rig: Path, tmp_path: Path) -> None:
         (["--eye", "to-hand", "--link", "panda_hand"], "moves against panda_link0"),
         (["--eye", "in-hand", "--keep-lens"], "reports no lens"),
         (["--eye", "in-hand", "--part", "left"], "name one with --part"),
-        (["--eye", "in-hand", "--dictionary", "6X6_100"], "markers of 5X5"),
-        (["--eye", "in-hand", "--squares", "7x5"], "this board has 0 to 16"),
+        pytest.param(["--eye", "in-hand", "--dictionary", "6X6_100"], "markers of 5X5", marks=LONG),
+        pytest.param(["--eye", "in-hand", "--squares", "7x5"], "board has 0 to 16", marks=LONG),
         (["--eye", "in-hand", "--squares", "9"], "wants COLUMNSxROWS"),
         (["--eye", "in-hand", "--square-m", "0.0285"], "measure it"),
         (["--eye", "to-hand"], "with in-hand they agree"),
