@@ -41,6 +41,8 @@ HEIGHT, WIDTH = 48, 64
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 HORIZON, DT_S = 4, 0.1
 CHUNK_MS, CHUNKS = 200, 10
+STATE_MS = 25
+"""Between states of the arm: most of a recording is of them."""
 PROMPTS = ("put the red brick in the box", "HARD: go up")
 
 
@@ -150,7 +152,7 @@ def _write_run(
             still = np.zeros(6)
             command = PoseCommand(place, DOWN, still, still, place, DOWN, "active", cause)
             samples.append(put(KEYS.command_pose, command, seen_ms + 33, seq))
-    for at_ms in range(0, end_ms, 10):
+    for at_ms in range(0, end_ms, STATE_MS):
         pose = PoseState(np.array([0.4, 0.0, at_ms / 1e4]), DOWN, np.zeros(6))
         samples.append(put(KEYS.state_pose, pose, at_ms, at_ms))
         samples.append(put(KEYS.state_gripper, GripperState(0.05, False, False), at_ms, at_ms))
@@ -237,7 +239,7 @@ def write_mixed_run(
     samples.append(put(KEYS.task, idle, end_ms, end_ms))
     shut = GripperCommand(PERSON_WIDTH_M, 0.1, 10.0)
     samples.append(put(KEYS.command_gripper, shut, sum(person_ms) / 2, 1))
-    for at_ms in range(0, end_ms + 500, 10):
+    for at_ms in range(0, end_ms + 500, STATE_MS):
         pose = PoseState(np.array([0.4, 0.0, at_ms / 1e4]), DOWN, np.zeros(6))
         samples.append(put(KEYS.state_pose, pose, at_ms, at_ms))
         samples.append(put(KEYS.state_gripper, GripperState(0.05, False, False), at_ms, at_ms))

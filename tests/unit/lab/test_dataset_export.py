@@ -25,6 +25,7 @@ from dataset_rig import (
     LATENCY_MS,
     PROFILE,
     PROMPTS,
+    STATE_MS,
     WIDTH,
     ZERO_NS,
     depth_counts,
@@ -171,7 +172,8 @@ def test_states_are_those_of_the_frames_time(dataset: Path) -> None:
     begin_ms = 500 + 5
     seen_ms = begin_ms + np.arange(20) * CHUNK_MS / USED
     seen_ms[:USED] += LATENCY_MS
-    np.testing.assert_allclose(states[:20, 2], seen_ms / 1e4, atol=6e-4)
+    nearest_ms = np.round(seen_ms / STATE_MS) * STATE_MS
+    np.testing.assert_allclose(states[:20, 2], nearest_ms / 1e4, atol=STATE_ATOL)
     np.testing.assert_allclose(states[:, [0, 1, 6]], [[0.4, 0.0, 0.05]] * 40, atol=STATE_ATOL)
 
 
