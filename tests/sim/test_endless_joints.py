@@ -100,7 +100,7 @@ def joint_commands(loop: Lockstep) -> list[JointCommand]:
     ("count", "kind", "turns"),
     [
         pytest.param(10, "delta", "wrapped", marks=pytest.mark.slow),
-        (2, "absolute", "wrapped"),
+        (1, "absolute", "wrapped"),
         pytest.param(10, "absolute", "wrapped", marks=pytest.mark.slow),
         pytest.param(10, "absolute", "counted", marks=pytest.mark.slow),
     ],

@@ -106,7 +106,7 @@ def test_a_figure_has_the_width_that_was_asked_for_and_text_of_8_points(
 
 def test_the_same_data_are_the_same_bytes(tmp_path: Path) -> None:
     for name in ("one", "two"):
-        drawn = drawing("motion")
+        drawn = drawing("latency")
         for end in (".pdf", ".svg", ".png"):
             write(drawn, tmp_path / f"{name}{end}")
     for end in (".pdf", ".svg", ".png"):
