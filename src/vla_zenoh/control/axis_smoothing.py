@@ -34,6 +34,7 @@ states", RSS 2021.
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -104,9 +105,14 @@ class AxisPlan:
         self.end = start + basis @ path.at_time(path.duration)[0]
         """(n,) its end."""
 
+    @cached_property
+    def path_extrema(self) -> tuple[FloatArray, FloatArray]:
+        """(k,) least and greatest values of the coordinates on the way."""
+        return _extrema(self._path)
+
     def extrema(self) -> tuple[FloatArray, FloatArray]:
         """(n,) bounds below and above the positions on the way."""
-        reached = np.stack([self._basis * extreme for extreme in _extrema(self._path)])
+        reached = np.stack([self._basis * extreme for extreme in self.path_extrema])
         least, most = reached.min(axis=0), reached.max(axis=0)
         return self._start + least.sum(axis=1), self._start + most.sum(axis=1)
 
@@ -264,7 +270,7 @@ class AxisSmoother:
                     continue
                 found = AxisPlan(self.state.position, basis, path, self._time_scale_of(most))
                 stop = basis, may_take, parts
-                if not (self._overshoots(path, along, stop) or self._leaves(found)):
+                if not (self._overshoots(found, along, stop) or self._leaves(found)):
                     if most is not limits:
                         self._jerk = most[2] / self.box[2]
                     self._planned_jerk = most[2]
@@ -330,14 +336,14 @@ class AxisSmoother:
         return each
 
     def _overshoots(
-        self, path: Trajectory, target: FloatArray, stop: tuple[FloatArray, FloatArray, list[float]]
+        self, plan: AxisPlan, target: FloatArray, stop: tuple[FloatArray, FloatArray, list[float]]
     ) -> bool:
         """Whether a coordinate leaves the range between its start, its target (k,) and its stop.
 
         `stop`: its basis, limits and parts, see `_input`.
         """
         least, most = np.minimum(target, 0.0) - OVERSHOOT, np.maximum(target, 0.0) + OVERSHOOT
-        low, high = _extrema(path)
+        low, high = plan.path_extrema
         if (low >= least).all() and (high <= most).all():
             return False
         ask = self._input(*stop)

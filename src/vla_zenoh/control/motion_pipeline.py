@@ -94,6 +94,8 @@ class MotionPipeline:
         self._settling = Settling(commanded)
         self._rest_since_ns: int | None = None
         self._tries = 0
+        self._looks_ahead = True
+        """Steps after the one that is due were bounded in the last tick."""
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -345,7 +347,8 @@ class MotionPipeline:
         # The leash starts where the arm is in this tick: it may be moving away from the last goal.
         short, hits = mover.leash(goal, ticks * self._dt_s)
         slower = self.scaling.slowest(goal)
-        if goal is not self.goal or hits or self.scaling.changes(mover, slower):
+        plans_motion = goal is not self.goal or bool(hits) or self.scaling.changes(mover, slower)
+        if plans_motion:
             if hits:
                 if goal is not self.goal:
                     name, value, limit = hits[0][:3]
@@ -354,7 +357,10 @@ class MotionPipeline:
             timed = TimedGoal(goal, timeline.plan, task.rate_hz, overdue_ns, now_ns)
             events += self.scaling.go_to(mover, timed, slower)
             self.goal = goal
-        events += limit_events(self._planner.bound_due(plans, now_ns, LOOK_AHEAD))
+        # Later steps can wait for a tick that plans no motion, which takes as long as they do.
+        self._looks_ahead = not (plans_motion and self._looks_ahead)
+        if self._looks_ahead:
+            events += limit_events(self._planner.bound_due(plans, now_ns, LOOK_AHEAD))
         return events
 
     def _shorten(self, plans: Sequence[Plan], goal: Goal, cut: Goal, now_ns: int) -> Goal:

@@ -429,3 +429,17 @@ def test_what_slowed_a_step_lasts_until_the_arm_is_through_with_it() -> None:
     long = keep_slowdown(slow._replace(late_s=9.0), slow, 0.1, 0.3)
     assert long is not None
     assert long.late_s == pytest.approx(0.6)
+
+
+def test_later_steps_are_bounded_before_they_are_due_though_every_tick_plans_a_motion() -> None:
+    rig = arm_rig(dt_s=0.004)
+    rig.tick(chunks=[rig.chunk([[0.0005, 0, 0, 0, 0, 0, 0]] * 30)])
+    ahead: list[int] = []
+    for _ in range(12):
+        rig.tick()
+        motion = rig.commander.parts[0].motion
+        assert motion.timeline is not None
+        plan = motion.timeline.plan
+        assert isinstance(plan, ChunkPlan)
+        ahead.append(plan.bounded - 1 - plan.due_index(rig.now_ns))
+    assert min(ahead[4:]) >= 3, ahead
