@@ -47,9 +47,9 @@ from vla_zenoh.types import (
 
 KEYS = Keys("panda")
 ZERO_NS = 1_700_000_000_000_000_000
-TICK_NS = 4_000_000
+TICK_NS, OFTEN_NS = 8_000_000, 4_000_000
 CHUNK_NS = 200_000_000
-STATE_NS = 5_000_000
+STATE_NS = 10_000_000
 SECONDS = 4
 SPEED_M_S = 0.05
 LAG_M = 0.002
@@ -290,9 +290,9 @@ def test_seams_tell_how_far_the_goal_went(evaluated: Evaluation) -> None:
 def motion_out_of_rest(rest_gap_ns: int) -> Iterable[Sample]:
     """Commands at rest for a second, this far apart, then a jerk of one size in every tick."""
     rest_ns, moving_ns = 1_000_000_000, 100_000_000
-    stamps_ns = [*range(0, rest_ns, rest_gap_ns), *range(rest_ns, rest_ns + moving_ns, TICK_NS)]
+    stamps_ns = [*range(0, rest_ns, rest_gap_ns), *range(rest_ns, rest_ns + moving_ns, OFTEN_NS)]
     for seq, at_ns in enumerate(stamps_ns):
-        t_s = max(at_ns - rest_ns + TICK_NS, 0) / 1e9
+        t_s = max(at_ns - rest_ns + OFTEN_NS, 0) / 1e9
         values = (JERK_M_S3 * np.array([t_s**3 / 6, t_s**2 / 2, t_s])).tolist()
         position, twist, acceleration = (np.array([value, 0, 0, 0, 0, 0]) for value in values)
         of = cause(int(t_s > 0))
@@ -304,7 +304,7 @@ def motion_out_of_rest(rest_gap_ns: int) -> Iterable[Sample]:
 
 def test_commands_that_are_rarer_at_rest_change_neither_jerk_nor_seams(tmp_path: Path) -> None:
     runs = []
-    for gap_ns in (TICK_NS, 5 * TICK_NS):
+    for gap_ns in (OFTEN_NS, 5 * OFTEN_NS):
         path = tmp_path / f"{gap_ns}" / "run.mcap"
         out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
         samples = [*motion_out_of_rest(gap_ns), *states(), *others()]
