@@ -28,10 +28,9 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 IN_REAL_TIME = {"wire", "fault", "netns", "ros2"}
 """Folders of tests that begin processes and wait for them: one file at a time on two cores."""
 WHOLE_ROBOTS = {"wire", "fault"}
-"""Of these, those with files of whole robots: one runs at a time, one of each with four cores."""
-KEEPS = "wire"
-"""Folder whose files hand a robot on to each other; those that kill its nodes begin with a new
-one."""
+"""Of these, those with files of whole robots: one runs at a time, one of each with four cores.
+Their files hand a robot on to each other, and those that kill its nodes are the last to have it."""
+KILLS = "fault"
 LEFT_OUT = {**dict.fromkeys(IN_REAL_TIME, "realtime"), "franka": "franka", "models": "models"}
 """Folder -> mark of everything in it."""
 
@@ -99,14 +98,15 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    robots_s: dict[Path, float] = {}
+    robots_s: dict[Path, tuple[float, bool]] = {}
     for item in items:
         if item.path.relative_to(ROOT).parts[1] in IN_REAL_TIME:
             item.add_marker(pytest.mark.realtime)
         if _is_lent_a_robot(item):
-            robots_s[item.path] = _patience_s(item)["command"]
+            kills = item.path.parent.name == KILLS
+            robots_s[item.path] = _patience_s(item)["command"], kills
     # Files that can go on with the same robot follow each other.
-    items.sort(key=lambda item: robots_s.get(item.path, 0.0))
+    items.sort(key=lambda item: robots_s.get(item.path, (0.0, False)))
 
 
 @pytest.hookimpl(tryfirst=True)  # before the fixtures are made
@@ -161,7 +161,7 @@ def _is_lent_a_robot(item: pytest.Item) -> bool:
     """Whether it takes the robot of this file, and its folder hands that on."""
     fixtures: Any = getattr(item, "_fixtureinfo", None)
     chains = fixtures.name2fixturedefs.get("shared_chain", ()) if fixtures else ()
-    return len(chains) == 1 and item.path.parent.name == KEEPS
+    return len(chains) == 1 and item.path.parent.name in WHOLE_ROBOTS
 
 
 def _patience_s(of: Any) -> Mapping[str, float]:
@@ -175,7 +175,7 @@ def shared_chain(
     """One robot for all tests of a file; take `chain` instead, which begins in order."""
     failed = request.session.testsfailed
     yield ROBOT.get(tmp_path_factory.mktemp("chain"), _patience_s(request))
-    if request.path.parent.name != KEEPS or request.session.testsfailed > failed:
+    if request.path.parent.name not in WHOLE_ROBOTS or request.session.testsfailed > failed:
         ROBOT.close()
 
 
@@ -185,5 +185,7 @@ def chain(shared_chain: Chain) -> Chain:
     shared_chain.settle()
     shared_chain.recorder.forget()
     shared_chain.client.pop_events()
+    for child in shared_chain.host.supervisor.children:
+        child.deaths_in_a_row = 0  # by the tests before: it would wait longer each time
     assert not shared_chain.failure, shared_chain.failure
     return shared_chain

@@ -40,7 +40,8 @@ END_PATIENCE_S = 10.0
 MOVING_M_S = 0.05
 STILL_M_S = 0.005
 """A measured arm that is slower than this stands: the impedance controller still settles."""
-WIDTH, HEIGHT, CAMERA_HZ = 160, 120, 20
+WIDTH, HEIGHT, CAMERA_HZ = 160, 120, 10
+"""As many pictures as the worker asks for: each is drawn by the processor."""
 LOW_M, HIGH_M = 0.30, 0.55
 UNKNOWN = np.full(3, np.nan)
 
