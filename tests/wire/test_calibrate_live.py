@@ -29,7 +29,7 @@ from vla_zenoh.types import Header, JointState
 
 WIDTH, HEIGHT = 640, 480
 HOSTS = "hosts: {here: {nodes: [router, sim, camera, command, worker, primitives]}}\n"
-STANDS_S = 1.6
+STANDS_S = 1.1
 LENS = {"fx_px": 500.0, "fy_px": 501.0, "cx_px": 320.0, "cy_px": 240.0}
 
 

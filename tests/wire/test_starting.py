@@ -45,7 +45,14 @@ class Model:
     def infer(self, observation):
         raise WorkerError(WHY)
 """
-BROKEN = {"import": "import time\ntime.sleep(4)\nraise ValueError('no model')\n", "load": MODEL}
+ON_ITS_WAY = """
+import time
+from pathlib import Path
+while not Path(__file__).with_name("go").exists():
+    time.sleep(0.05)
+raise ValueError('no model')
+"""
+BROKEN = {"import": ON_ITS_WAY, "load": MODEL}
 WHY = {"import": "no model", "load": "action is scaled by MEAN_STD, and there are no statistics"}
 
 
@@ -73,6 +80,7 @@ def test_a_worker_that_is_started_by_hand_is_starting_and_then_crashed(
             try:
                 if how == "import":
                     assert client.wait_for(lambda: has(STARTING), 30.0)
+                    (tmp_path / "go").touch()
                 assert client.wait_for(lambda: has(CRASHED), 30.0)
             finally:
                 worker.kill()
