@@ -56,6 +56,11 @@ LAB = """\
 extends: panda_sim
 hosts: {here: {nodes: [router, sim, camera, command, worker, primitives]}}
 """
+SMALL = """\
+extends: panda_sim
+cameras: {wrist: null}
+hosts: {here: {nodes: [router, sim, camera, command]}}
+"""
 PREPARED = "openpi in an environment of its own"
 LINES = [
     *("profile check panda_sim", "profile check fr3", "profile check panda_ros2"),
@@ -179,8 +184,9 @@ def test_up_says_at_its_start_that_a_node_of_its_host_needs_a_package(
 def test_up_runs_without_a_rolling_record_and_names_its_package(
     alone: dict[str, str], tmp_path: Path
 ) -> None:
-    router = free_endpoint()
-    words = ["up", "panda_sim", "--dry-run", "--connect", router, "--listen", router]
+    router, small = free_endpoint(), tmp_path / "small.yaml"
+    small.write_text(SMALL, "utf-8")
+    words = ["up", str(small), "--dry-run", "--connect", router, "--listen", router]
     lines = []
     with subprocess.Popen(
         [sys.executable, "-S", "-m", "vla_zenoh", *words, "--log-dir", str(tmp_path)],

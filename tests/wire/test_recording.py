@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_rig import until
-from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
+from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain
 from recording_rig import assert_same, ghost_of, recording
 from rosbags.rosbag2 import Reader
+from typed import typed
 from vla_zenoh_replay.replay import CAMERAS, Replay
 
 from vla_zenoh.bus.node import Publisher
@@ -158,14 +159,14 @@ def moved_equally(one: Run, other: Run, kind: str) -> None:
 
 
 def test_a_replayed_run_evaluates_as_the_original(
-    run_file: Path, chain: Chain, tmp_path: Path
+    run_file: Path, chain: Chain, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ghost, again = ghost_of(chain), tmp_path / "again.mcap"
     with recording(chain, again, ghost):
-        done = command_line(
-            "replay", str(run_file), "--robot", "ghost", "--json", profile=chain.profile_file
-        )
-        assert done.returncode == 0, done.stderr
+        profile = str(chain.profile_file)
+        words = ("replay", str(run_file), "--robot", "ghost", "--json", "--profile", profile)
+        done = typed(capsys, *words)
+        assert done.code == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["failure"] == ""
     assert set(result["interval_error_ms"]) == {"p50", "p95", "max"}
@@ -320,22 +321,26 @@ def test_a_full_disk_ends_the_recording_and_spares_the_file(chain: Chain, tmp_pa
     assert len(run.poses) > 10
 
 
-def test_the_recorder_says_how_it_goes(chain: Chain, tmp_path: Path) -> None:
+def test_the_recorder_says_how_it_goes(
+    chain: Chain, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "a.mcap"
-    done = command_line(
+    done = typed(
+        capsys,
         "record",
         "--output",
         str(path),
         "--seconds",
-        "2",
+        "1",
         "--keys",
         "state/*",
         "--keys",
         "status/recorder",
         "--json",
-        profile=chain.profile_file,
+        "--profile",
+        str(chain.profile_file),
     )
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr
     result: dict[str, Any] = json.loads(done.stdout)
     assert (result["dropped"], result["failure"]) == ({}, "")
     assert result["size_bytes"] == path.stat().st_size

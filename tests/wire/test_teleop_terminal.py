@@ -7,11 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 import zenoh
 from camera_rig import until
-from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line, write_profile
+from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, write_profile
 from recording_rig import recording
 from teleop_rig import Screen, teleop
+from typed import typed
 from vla_zenoh_dataset.episodes import episodes_of
 from vla_zenoh_teleop.keyboard import END
 
@@ -207,7 +209,7 @@ def test_enter_never_activates_an_arm_whose_state_is_unknown(tmp_path: Path) -> 
     assert heard == ["false"]
 
 
-def test_without_a_terminal_it_says_so(chain: Chain) -> None:
-    done = command_line("teleop", profile=chain.profile_file, timeout_s=READY_PATIENCE_S)
-    assert done.returncode == 1
+def test_without_a_terminal_it_says_so(chain: Chain, capsys: pytest.CaptureFixture[str]) -> None:
+    done = typed(capsys, "teleop", "--profile", str(chain.profile_file))
+    assert done.code == 1
     assert "teleop needs a terminal" in done.stderr

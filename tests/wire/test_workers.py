@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from chain import MOVING_M_S, READY_PATIENCE_S, Chain, command_line
+from typed import typed
 from vla_zenoh_diagnose.inference_views import InferenceDebugSubscriber, InferenceView
 
 from vla_zenoh.bus.host import own_boot_id
@@ -170,7 +171,7 @@ def test_a_worker_that_is_not_there_is_refused_in_motion_and_the_arm_goes_on(
 
 
 def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
-    chain: Chain, tmp_path: Path
+    chain: Chain, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = tmp_path / "looker.py"
     model.write_text(LOOKER)
@@ -201,11 +202,9 @@ def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
             assert sight.record.steps.shape == (2, 6)
 
         out = tmp_path / "out"
-        said = command_line(
-            *("inspect", "--count", "2", "--json", "--output", str(out)),
-            profile=chain.profile_file,
-        )
-        assert said.returncode == 0, said.stderr
+        words = ("inspect", "--count", "2", "--json", "--output", str(out))
+        said = typed(capsys, *words, "--profile", str(chain.profile_file))
+        assert said.code == 0, said.stderr
         lines = [json.loads(line) for line in said.stdout.splitlines()]
         assert {line["worker"] for line in lines} <= {"looker", "scripted"}
         assert len(list(out.glob("*/*.json"))) == 2
