@@ -432,7 +432,7 @@ def test_what_slowed_a_step_lasts_until_the_arm_is_through_with_it() -> None:
 
 
 def test_later_steps_are_bounded_before_they_are_due_though_every_tick_plans_a_motion() -> None:
-    rig = arm_rig(dt_s=0.004)
+    rig = arm_rig(profile(timing=OFTEN), dt_s=0.004)
     rig.tick(chunks=[rig.chunk([[0.0005, 0, 0, 0, 0, 0, 0]] * 30)])
     ahead: list[int] = []
     for _ in range(12):
