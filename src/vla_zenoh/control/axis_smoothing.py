@@ -207,9 +207,14 @@ class AxisSmoother:
     def brake_together(self, shares: Shares = FULL) -> None:
         """Come to rest with all axes together, as `shares` of the limits hold for one direction.
 
-        More jerk is used if the arm would otherwise exceed the velocity limit.
+        More jerk is used if the arm would otherwise exceed the velocity limit. Axes that do not
+        move in proportion may pass their targets: each takes as long as the slowest one.
         """
         self._brake(shares)
+
+    def brake_on_line(self) -> None:
+        """Come to rest on the straight line of the motion; on none, each axis by itself."""
+        self._brake(None if self._line() is None else FULL)
 
     def _brake(self, shares: Shares | None) -> None:
         if self.braking:
@@ -359,16 +364,22 @@ class AxisSmoother:
         )
 
     def _stop(self, limits: FloatArray, *, together: bool) -> AxisPlan | None:
-        size = limits.shape[1]
-        basis = np.eye(size)
-        ask = self._input(basis, limits, [1.0] * size)
+        """The plan of a stop; `together`: on the straight line of the motion, or in one time."""
+        line = self._line() if together else None
+        basis = np.eye(limits.shape[1]) if line is None else line[:, None]
+        ask = self._input(basis, limits, [1.0] * basis.shape[1])
         ask.control_interface = ControlInterface.Velocity
-        for synchronization in [Synchronization.Phase] * together + [Synchronization.No]:
+        for synchronization in [Synchronization.Time] * together + [Synchronization.No]:
             ask.synchronization = synchronization
             path = self._calculated(ask)
             if path is not None:
                 return AxisPlan(self.state.position, basis, path, self._time_scale_of(limits))
         return None
+
+    def _line(self) -> FloatArray | None:
+        """Direction (n,) of a motion in which all axes move in proportion, None of any other."""
+        line = line_of(np.zeros(len(self.state.position)), *self.state[1:], 1.0)
+        return None if line is None or not line.any() else line
 
     def _input(
         self, basis: FloatArray, limits: FloatArray, parts: list[float], *, slowly: bool = False

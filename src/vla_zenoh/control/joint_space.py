@@ -18,7 +18,7 @@ from copy import copy
 import numpy as np
 
 from vla_zenoh.control.actions import step_joints
-from vla_zenoh.control.axis_smoothing import AxisSmoother, line_of
+from vla_zenoh.control.axis_smoothing import AxisSmoother
 from vla_zenoh.control.limits import (
     FULL,
     LEAST_TO_GOAL,
@@ -413,14 +413,7 @@ class JointPath(AxisSmoother):
     def brake(self) -> None:
         """Come to rest as `tick` has checked it."""
         self._before_bound = False
-        self._brake(FULL if self._is_straight() else None)
-
-    def _is_straight(self) -> bool:
-        """The joints move in proportion, so that a stop can end on their straight line.
-
-        Else each stops by itself: one that waited for another to stop would pass its target.
-        """
-        return line_of(np.zeros(len(self.state.position)), *self.state[1:], 1.0) is not None
+        self.brake_on_line()
 
     def _brake_at(self, hit: LimitHit | None) -> None:
         if hit is not None:
@@ -486,7 +479,7 @@ class JointPath(AxisSmoother):
 
         The stop is no straight line of the joints where they do not all move in proportion.
         """
-        stop = self._stop(self.box, together=self._is_straight())
+        stop = self._stop(self.box, together=self._line() is not None)
         if stop is None:
             return None
         steps = math.ceil(stop.duration_s / STOP_STEP_S)

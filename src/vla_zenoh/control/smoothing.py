@@ -196,7 +196,7 @@ class PosePath(Smoother):
 
     def pause(self) -> None:
         """Come to rest on the path, to go on from there."""
-        self.brake_together()
+        self.brake_on_line()
 
     def taken_hits(self) -> list[LimitHit]:
         """Limits that acted on the motion since the last call."""

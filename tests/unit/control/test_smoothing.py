@@ -10,7 +10,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.limits import PAUSE_LEAD_M, PAUSE_LEAD_RAD, MotionLimits, Shares
+from vla_zenoh.control.limits import (
+    PAUSE_LEAD_M,
+    PAUSE_LEAD_RAD,
+    MotionLimits,
+    Shares,
+    workspace_corners,
+)
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.control.smoothing import Motion, PosePath, Smoother
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, norm3
@@ -29,6 +35,7 @@ STEP_ATOL_M, STEP_ATOL_RAD = 2e-7, 1e-6
 BACKWARDS_M_S = 1e-9
 SPEED_ATOL = np.array([2e-4] * 3 + [1e-3] * 3)
 SLOWEST, REACH_M = 0.1, 0.15
+OUTSIDE_M = 1e-5
 
 offsets = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
 targets = st.tuples(offsets, offsets).map(lambda pair: (REACH_M * pair[0], 0.6 * pair[1]))
@@ -475,3 +482,28 @@ def test_the_goal_of_an_arm_that_is_held_is_on_its_way_and_no_further_than_it_ca
     np.testing.assert_allclose(near.position_m, START.position_m + share * way_m * way, atol=1e-12)
     turned = log3(near.rotation @ START.rotation.T)
     np.testing.assert_allclose(turned, share * way_rad * turn, atol=1e-9)
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.5])
+def test_a_pause_on_a_curved_way_ends_inside_the_box(speed: float) -> None:
+    """No axis waits for another to stop, and passes the face that it was to stop at."""
+    of = load_profile("panda_sim")
+    low, high = workspace_corners(of.limits)
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        path = PosePath(of)
+        path.reset(Pose(rng.uniform(low, high), START.rotation))
+        for _ in range(3):
+            here = path.motion.pose
+            corner = np.clip(
+                rng.choice([low, high]), here.position_m - 0.15, here.position_m + 0.15
+            )
+            goal = Goal(Pose(corner, exp3(rng.uniform(-0.2, 0.2, 3)) @ here.rotation), 0.0)
+            path.go_to(goal, Shares(speed, speed**2, speed**3))
+            for _ in range(int(rng.integers(5, 200))):
+                path.tick()
+        path.pause()
+        while not path.at_rest:
+            place = path.tick().pose.position_m
+            assert (low - OUTSIDE_M <= place).all()
+            assert (place <= high + OUTSIDE_M).all()
