@@ -214,6 +214,9 @@ class AxisSmoother:
 
     def brake_on_line(self) -> None:
         """Come to rest on the straight line of the motion; on none, each axis by itself."""
+        if self.braking:
+            return
+        self._settle(FULL)  # in the axes of the stop: what is straight in others may not be in them
         self._brake(None if self._line() is None else FULL)
 
     def _brake(self, shares: Shares | None) -> None:
