@@ -1254,6 +1254,30 @@ def test_a_faster_rate_shortens_the_time_to_the_next_chunk_and_puts_of_it_do_not
     assert rig.state == "holding"
 
 
+def test_at_a_faster_rate_the_next_chunk_has_a_period_from_then_on() -> None:
+    rig = Rig(profile(timing={"watchdog_s": 0.05}))
+    rig.put("rate", 0.5)
+    rig.activate()
+    rig.send([[0.0] * 7])
+    rig.run(1.0)
+    rig.put("rate", 5.0)
+    rig.run(0.15)
+    assert rig.state == "active"
+    rig.run(0.15)
+    assert rig.state == "holding"
+
+
+def test_a_step_that_lasts_longer_than_max_open_loop_does_not_put_off_the_next_chunk() -> None:
+    rig = Rig(profile(timing={"max_open_loop_s": 0.5, "watchdog_s": 0.1}), dt_s=2.0)
+    rig.put("rate", 10.0)
+    rig.activate()
+    rig.send([[0.0] * 7])
+    rig.run(0.65)
+    assert rig.state == "active"
+    rig.run(0.1)
+    assert rig.state == "holding"
+
+
 def test_the_gripper_of_a_part_that_is_not_there_holds_nothing() -> None:
     rig = Rig()
     rig.tick(Setting("held", None, None, "left"))

@@ -78,6 +78,22 @@ def test_a_goal_that_the_leash_cuts_stays_inside_the_box_and_on_the_leash() -> N
     assert cuts > 50
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_goal_before_or_behind_a_moving_arm_is_on_the_leash_of_its_next_command(
+    sign: float,
+) -> None:
+    path, joint = made_path(100.0), np.eye(7)[6]
+    path.go_to(joint_goal(path.kinematics, HOME_RAD + 0.5 * joint, 0.0))
+    for _ in range(20):
+        path.tick()
+    asked = joint_goal(path.kinematics, HOME_RAD + 2.0 * sign * joint, 0.0)
+    goal, _ = path.leash(asked, 0.01)
+    path.go_to(goal)
+    path.tick()
+    lead_rad = (goal.known_rad - path.state.position)[6]
+    assert lead_rad == pytest.approx(sign * LEAD_RAD, abs=1e-3)
+
+
 def test_commands_stay_inside_the_box_whenever_the_goal_changes() -> None:
     """The goals are inside; it is the way to them, and the stop, that could leave the box."""
     rng, path = np.random.default_rng(1), made_path()

@@ -287,6 +287,18 @@ def test_seams_tell_how_far_the_goal_went(evaluated: Evaluation) -> None:
     assert run.seam_velocity_mm_s.max() == pytest.approx(50.0, abs=0.01), "it stops at once"
 
 
+def test_a_recording_that_begins_with_the_last_command_of_a_chunk_has_that_seam(
+    tmp_path: Path,
+) -> None:
+    path, begun_ns = tmp_path / "run.mcap", ZERO_NS + 2 * CHUNK_NS - TICK_NS
+    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    few = [each for each in commands() if 0 <= each.stamp_ns - begun_ns < CHUNK_NS]
+    for sample in sorted([*few, *states(), *others()], key=heard_at):
+        out.write(sample)
+    out.finish({"dropped": {}})
+    assert len(evaluate_loaded(load_run(path)).seam_goal_mm) == 1
+
+
 def motion_out_of_rest(rest_gap_ns: int) -> Iterable[Sample]:
     """Commands at rest for a second, this far apart, then a jerk of one size in every tick."""
     rest_ns, moving_ns = 1_000_000_000, 100_000_000

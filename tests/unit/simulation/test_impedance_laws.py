@@ -386,3 +386,7 @@ def test_what_is_taken_over_stays_within_the_integrals_bounds(arm: Arm) -> None:
     state, law = resting(arm), joint_law()
     law.take_over(state.bias_nm + 50.0, state)
     np.testing.assert_array_equal(law.integral, JointGains().max_integral_nm)
+    of_tcp, gains = controller(arm, ImpedanceGains()), ImpedanceGains()
+    of_tcp.take_over(state.bias_nm + state.jacobian.T @ np.repeat([-50.0, 10.0], 3), state)
+    most = np.repeat([-gains.max_integral_n, gains.max_integral_nm], 3)
+    np.testing.assert_allclose(of_tcp.integral, most)
