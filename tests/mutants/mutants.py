@@ -40,7 +40,17 @@ FIRST_TESTS = 15
 LIMIT_BYTES = 16 * 2**30
 """Of a process with a mutant that takes more and more memory."""
 FORK = multiprocessing.get_context("forkserver")
-LIBRARIES = ["hypothesis", "numpy", "pinocchio", "pydantic", "pytest", "coverage", "cv2", "ruckig"]
+LIBRARIES = [
+    "hypothesis",
+    "numpy",
+    "pinocchio",
+    "pydantic",
+    "pytest",
+    "coverage",
+    "cv2",
+    "ruckig",
+    "daqp",
+]
 """Imported once, for all processes."""
 
 Times = dict[str, float]

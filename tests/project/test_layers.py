@@ -264,6 +264,7 @@ def test_importing_the_package_loads_no_library_at_all() -> None:
 OPTIONAL = (
     "pinocchio",
     "ruckig",
+    "daqp",
     "mujoco",
     "matplotlib",
     "av",

@@ -62,7 +62,7 @@ def test_torch_comes_only_when_asked_for(project: dict) -> None:
 
 
 def test_a_camera_host_gets_no_simulator_and_no_kinematics(project: dict) -> None:
-    heavy = {"pin", "ruckig", "mujoco", "mujoco-core", "torch", "matplotlib", "av"}
+    heavy = {"pin", "ruckig", "daqp", "mujoco", "mujoco-core", "torch", "matplotlib", "av"}
     assert heavy.isdisjoint(map(name_of, project["dependencies"]))
 
 

@@ -32,6 +32,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import daqp
 import numpy as np
 
 from vla_zenoh.control.limits import LimitHit, bound_norm, stop_s_of, workspace_corners
@@ -54,8 +55,8 @@ ACCELERATION_HALVINGS = 8
 NEAR_SHARE, FAR_SHARE = 0.7, 0.1
 """Part of the joints' acceleration and jerk for a far target, a distance constraint or a
 singularity: they follow the pose besides. And for the first test whether a constraint is far."""
-ROUNDS = 3
-"""Times that the constraints are gone through."""
+EXCESS_COST = 1e6
+"""Cost of approaching a constraint too fast beside that of the TCP's motion."""
 ELBOW_COST = 1e-2
 """Cost of a joint's motion beside that of the TCP's."""
 BACK_JERK = 0.4
@@ -287,50 +288,25 @@ class JointFollower:
         others = 1.0 - np.clip(rows @ ways, 0.0, 1.0)
         others[rows @ reached <= 0] = 0.0
         efforts = np.maximum(np.abs(ways) @ (np.eye(len(near)) + others), ROUNDING_RAD_S)
-        known = left_m[near].tolist(), (rows @ now.velocity_rad_s).tolist()
-        # What holds one may lead to another.
-        for index, row, way, effort, left, before in ROUNDS * [
-            *zip(near, rows, ways.T, efforts.T, *known, strict=True)
-        ]:
-            nearer = float(row @ reached)
-            if nearer <= 0:
-                continue
-            change = _towards_end(
-                left,
-                before,
-                (float(np.minimum(row * low, row * high).sum()) - before) / dt_s,
-                (nearer - before) / dt_s,
-                NEAR_SHARE * float(np.min(self.acceleration_rad_s2 / effort)),
-                NEAR_SHARE * float(np.min(self.jerk_rad_s3 / effort)),
-                dt_s,
-            )
-            allowed = before + change * dt_s
-            if nearer > allowed:
-                hits.append(self.constraints.hit(index, left))
-                reached = self._slower_along(row, way, allowed, reached, low, high)
-        return reached, hits
-
-    @staticmethod
-    def _slower_along(
-        row: FloatArray,
-        first: FloatArray,
-        allowed: float,
-        reached: FloatArray,
-        low: FloatArray,
-        high: FloatArray,
-    ) -> FloatArray:
-        """`reached`, within its bounds, no faster along `row` than `allowed`."""
-        for way in (first, row, row):
-            excess = float(row @ reached) - allowed
-            # Joints at their bound cannot contribute.
-            free = np.where(np.where(way > 0, reached > low, reached < high), way, 0.0)
-            gain = float(row @ free)
-            if excess <= 0:
-                break
-            if gain <= 0:  # what is left of this way leads nearer
-                continue
-            reached = np.minimum(np.maximum(reached - excess / gain * free, low), high)
-        return reached
+        # How fast each constraint is approached, and could be after this tick.
+        before = rows @ now.velocity_rad_s
+        slowest = np.minimum(rows * low, rows * high).sum(axis=1)
+        quickest = np.maximum(rows * low, rows * high).sum(axis=1)
+        bounds = (
+            left_m[near],
+            before,
+            (slowest - before) / dt_s,
+            (quickest - before) / dt_s,
+            NEAR_SHARE * (self.acceleration_rad_s2[:, None] / efforts).min(axis=0),
+            NEAR_SHARE * (self.jerk_rad_s3[:, None] / efforts).min(axis=0),
+        )
+        change = [_towards_end(*one, dt_s=dt_s) for one in np.stack(bounds, axis=1).tolist()]
+        allowed = before + np.array(change) * dt_s
+        too_fast = np.flatnonzero(rows @ reached > allowed + ROUNDING_RAD_S)
+        if not len(too_fast):
+            return reached, hits
+        hits = [self.constraints.hit(near[row], float(left_m[near[row]])) for row in too_fast]
+        return nearest_velocities(reached, metric, rows, allowed, low, high), hits
 
     def _wanted(
         self,
@@ -422,6 +398,46 @@ class JointFollower:
         high = np.maximum(np.minimum(greatest, top[0]), least)
         low = np.minimum(np.maximum(least, -top[1]), greatest)
         return velocity + np.minimum(low, high) * dt_s, velocity + high * dt_s
+
+
+def nearest_velocities(
+    wanted: FloatArray,
+    metric: FloatArray,
+    rows: FloatArray,
+    allowed: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+) -> FloatArray:
+    """Joint velocities (n,) within ``[low, high]`` that approach no constraint faster than allowed.
+
+    Those nearest to `wanted`: a quadratic program, in which constraints that no joint velocities
+    within their bounds meet are exceeded by as little as possible, ``s`` (m,)::
+
+        min  (qd - wanted)^T metric (qd - wanted) + EXCESS_COST |s|^2
+        rows qd - s <= allowed,   low <= qd <= high
+
+    Args:
+        wanted: (n,) rad/s.
+        metric: (n, n) cost of a change.
+        rows: (m, n) constraints, m/rad.
+        allowed: (m,) m/s.
+        low: (n,) rad/s.
+        high: (n,) rad/s.
+    """
+    size, count = len(wanted), len(rows)
+    cost = np.zeros((size + count, size + count))
+    cost[:size, :size] = metric
+    cost[size:, size:] = EXCESS_COST * np.eye(count)
+    linear = np.concatenate([-metric @ wanted, np.zeros(count)])
+    no_bound = np.full(count, np.inf)
+    upper = np.concatenate([high, no_bound, allowed])
+    lower = np.concatenate([low, -no_bound, -no_bound])
+    solution, _, flag, _ = daqp.solve(
+        cost, linear, np.concatenate([rows, -np.eye(count)], axis=1), upper, lower
+    )
+    if flag < 1:  # rounding let it cycle: every joint brakes as hard as it can
+        return np.minimum(np.maximum(0.0, low), high)
+    return np.minimum(np.maximum(solution[:size], low), high)
 
 
 def _towards_end(

@@ -12,7 +12,7 @@ from typing import Any
 from vla_zenoh.cli.silence import silence
 
 EXTRA_OF = {
-    **dict.fromkeys(("pinocchio", "ruckig"), "control"),
+    **dict.fromkeys(("pinocchio", "ruckig", "daqp"), "control"),
     **dict.fromkeys(("mujoco", "av"), "sim"),
     **dict.fromkeys(("mcap", "plotly", "jinja2", "rosbags"), "record"),
 }

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import daqp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.joint_follower import DistanceConstraints, JointFollower, JointMotion
+from vla_zenoh.control.joint_follower import (
+    ELBOW_COST,
+    EXCESS_COST,
+    DistanceConstraints,
+    JointFollower,
+    JointMotion,
+    nearest_velocities,
+)
 from vla_zenoh.control.limits import into_workspace, joint_motion_limits, motion_limits
 from vla_zenoh.control.pose_to_joint import FAR, LAG_M, LAG_RAD, PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
@@ -231,13 +239,55 @@ def test_the_tcp_stays_in_a_corner_of_its_box_whose_faces_need_the_same_joints()
     assert -BEYOND_BOX_M <= beyond_m <= BEYOND_BOX_M
 
 
-def test_a_face_of_the_box_holds_where_the_easiest_joint_brakes_as_hard_as_it_can() -> None:
-    row, easiest = np.array([0.3, 0.2, -0.1]), np.array([4.0, -0.5, 1.0])
-    reached, low, high = np.array([0.1, 0.2, -0.1]), np.array([0.1, 0.0, -0.3]), np.full(3, 0.4)
-    slower = JointFollower._slower_along(row, easiest, 0.04, reached, low, high)
-    assert float(row @ slower) == pytest.approx(0.04)
-    assert (slower >= low).all()
-    assert (slower <= high).all()
+@st.composite
+def constrained_velocities(draw: st.DrawFn) -> tuple[FloatArray, ...]:
+    """What `nearest_velocities` takes, of three joints and two constraints."""
+    numbers = st.floats(-1.0, 1.0)
+    three = st.tuples(numbers, numbers, numbers).map(np.array)
+    jacobian, wanted, middle = np.array([draw(three) for _ in range(3)]), draw(three), draw(three)
+    room = np.array([draw(st.floats(0.01, 1.0)) for _ in range(3)])
+    allowed = np.array([draw(numbers), draw(numbers)])
+    metric = jacobian.T @ jacobian + ELBOW_COST * np.eye(3)
+    return wanted, metric, jacobian[:2], allowed, middle - room, middle + room
+
+
+@given(constrained_velocities(), st.integers(0, 2**32 - 1))
+@settings(max_examples=100)
+def test_no_velocities_within_the_limits_of_the_joints_are_nearer_or_exceed_constraints_less(
+    given: tuple[FloatArray, ...], seed: int
+) -> None:
+    wanted, metric, rows, allowed, low, high = given
+    found = nearest_velocities(*given)
+    assert (found >= low).all()
+    assert (found <= high).all()
+
+    def cost(velocities: FloatArray) -> FloatArray:
+        change = velocities - wanted
+        excess = np.maximum(velocities @ rows.T - allowed, 0.0)
+        return ((change @ metric) * change).sum(-1) + EXCESS_COST * (excess**2).sum(-1)
+
+    rng = np.random.default_rng(seed)
+    anywhere = rng.uniform(low, high, (200, 3))
+    nearby = np.clip(found + rng.normal(0.0, 1e-3, (200, 3)), low, high)
+    assert cost(found) <= cost(np.concatenate([anywhere, nearby])).min() * (1 + 1e-9) + 1e-9
+
+
+def test_a_constraint_holds_where_the_joint_that_costs_least_brakes_as_hard_as_it_can() -> None:
+    row, metric = np.array([[0.3, 0.2, -0.1]]), np.diag([0.01, 1.0, 1.0])
+    wanted, low, high = np.array([0.1, 0.2, -0.1]), np.array([0.1, 0.0, -0.3]), np.full(3, 0.4)
+    found = nearest_velocities(wanted, metric, row, np.array([0.04]), low, high)
+    assert float(row[0] @ found) == pytest.approx(0.04, abs=1e-6)
+    assert found[0] == pytest.approx(0.1)
+
+
+def test_every_joint_brakes_where_the_program_has_no_solution(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Which no input is known to cause."""
+    monkeypatch.setattr(daqp, "solve", lambda *_: (np.full(4, np.nan), 0.0, -2, {}))
+    low, high = np.array([-0.3, 0.1, -0.5]), np.array([0.3, 0.4, -0.2])
+    found = nearest_velocities(high, np.eye(3), np.eye(3)[:1], np.zeros(1), low, high)
+    assert found.tolist() == [0.0, 0.1, -0.2]
 
 
 def test_a_goal_beyond_the_leash_is_followed_as_one_on_it_and_told() -> None:

@@ -12,7 +12,7 @@ from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.lab.cli.options import DemoOptions
 
 TASK_PROFILE = "panda_bricks"
-NEEDED = ("mujoco", "pinocchio", "ruckig", "mcap", "plotly", "av")
+NEEDED = ("mujoco", "pinocchio", "ruckig", "daqp", "mcap", "plotly", "av")
 EXTRAS = "brick,sim"
 """Extras of the demo; without `sim` nothing of it works."""
 

@@ -27,7 +27,7 @@ MODULES: Mapping[Role, Mapping[str, str]] = {
         "yaml": "pyyaml",
     },
     "camera": {"cv2": "opencv-python-headless"},
-    "control": {"pinocchio": "pin", "ruckig": "ruckig"},
+    "control": {"pinocchio": "pin", "ruckig": "ruckig", "daqp": "daqp"},
     "sim": {"mujoco": "mujoco-core", "av": "av"},
 }
 PURPOSE: Mapping[Role, str] = {
