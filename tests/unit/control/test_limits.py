@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.control.limits import bound_step, into_workspace, leash
+from vla_zenoh.control.limits import bound_step, full_speed_s, into_workspace, leash
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, norm3
 from vla_zenoh.profile import REJECT_FACTOR, Limits
 
@@ -45,6 +45,15 @@ def test_a_bounded_step_is_short_and_inside_and_points_the_same_way(
     assert ("step_rad" in names) == (norm3(turn) > LIMITS.step_rad * (1 + 1e-6))
     if "workspace" not in names:
         assert norm3(np.cross(moved, way)) < 1e-9
+
+
+@given(ways, turns)
+def test_a_step_takes_as_long_back_as_forth(way: np.ndarray, turn: np.ndarray) -> None:
+    after = Pose(BEFORE.position_m + way, exp3(turn) @ BEFORE.rotation)
+    forth_s, back_s = full_speed_s(LIMITS, BEFORE, after), full_speed_s(LIMITS, after, BEFORE)
+    assert forth_s == pytest.approx(back_s)
+    assert forth_s >= np.abs(way).max() / LIMITS.translation.velocity_m_s * (1 - ATOL)
+    assert forth_s >= norm3(turn) / 2 / LIMITS.rotation.velocity_rad_s
 
 
 def test_a_step_within_all_bounds_is_not_touched() -> None:

@@ -193,6 +193,33 @@ def test_half_a_turn_is_reached_in_small_targets_without_wrapping() -> None:
     assert angle_between(START.rotation, goal) == pytest.approx(2 * math.pi - 4.0)
 
 
+def test_a_turn_that_gets_other_axes_over_and_over_has_no_step_in_its_speed() -> None:
+    rng, motion = np.random.default_rng(0), smoother()
+    for _ in range(8):
+        ordered(motion, (REACH_M * rng.uniform(-1, 1, 3), 0.6 * rng.uniform(-1, 1, 3)))
+        for _ in range(rng.integers(20, 60)):
+            before = motion.motion
+            check_tick(before, motion.tick())
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_goal_before_or_behind_a_moving_tcp_is_on_the_leash_of_its_next_command(
+    sign: float,
+) -> None:
+    profile = load_profile("panda_sim")
+    path, side = PosePath(profile), np.eye(3)[1]
+    path.reset(START)
+    path.go_to(Goal(Pose(START.position_m + 0.1 * side, START.rotation), 0.0))
+    for _ in range(60):
+        path.tick()
+    asked = Goal(Pose(START.position_m + 0.35 * sign * side, START.rotation), 0.0)
+    goal, hits = path.leash(asked, 1 / profile.timing.command_hz)
+    path.go_to(goal)
+    lead_m = (goal.pose.position_m - path.tick().pose.position_m)[1]
+    assert [hit.name for hit in hits] == ["lead_m"]
+    assert lead_m == pytest.approx(sign * profile.limits.lead_m, abs=1e-5)
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e9])
 def test_an_impossible_target_brakes_and_the_next_good_one_is_reached(bad: float) -> None:
     motion = smoother()

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import time
+from threading import Event, Thread
 
 import numpy as np
 import pytest
 import zenoh
-from camera_rig import routed_session
+from camera_rig import routed_session, until
 from driver_report import Report
 
 from vla_zenoh.bus.clock import Tick
 from vla_zenoh.client.client import Client
-from vla_zenoh.codec import records
+from vla_zenoh.codec import message, records
 from vla_zenoh.kinematics.so3 import quat_from_rotation
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.node import RobotNode
-from vla_zenoh.robots.sim_driver import SimDriver
-from vla_zenoh.simulation.world import STEP_NS
+from vla_zenoh.robots.sim_driver import SimDriver, in_world_time
+from vla_zenoh.simulation.world import STEP_NS, STEP_S
 from vla_zenoh.types import (
     GripperCommand,
     Header,
@@ -92,11 +93,12 @@ def test_states_are_published_at_the_state_rate_in_real_time() -> None:
         node._close()
 
 
-def test_the_gripper_closes(driver: SimDriver) -> None:
+@pytest.mark.parametrize("force_n", [20.0, 0.0])
+def test_the_gripper_closes_also_with_no_force(driver: SimDriver, force_n: float) -> None:
     driver.reset(None)
-    driver.parts[""].grip(GripperCommand(0.0, 0.1, 20.0), 0)
+    driver.parts[""].grip(GripperCommand(0.0, 0.1, force_n), 0)
     here = driver.parts[""].state_now().pose
-    run(driver, PoseReference(here.position_m, here.rotation, STILL, STILL))
+    run(driver, PoseReference(here.position_m, here.rotation, STILL, STILL), 900)
     assert driver.world.gripper_state().width_m < SHUT_M
 
 
@@ -111,6 +113,90 @@ def test_a_reset_puts_the_arm_home_and_is_counted(driver: SimDriver) -> None:
     assert report.counters["sim.resets"] == before + 1
     assert driver.status_changed()
     assert not driver.status_changed()
+
+
+def test_a_world_that_takes_twice_its_time_is_led_twice_as_fast_from_its_first_step_on() -> None:
+    joints = JointReference(np.full(7, 0.3), np.full(7, 0.1), np.full(7, 0.5))
+    for ours, theirs in zip(in_world_time(joints, 1.0, 1), joints, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    first = in_world_time(joints, 2.0, 4)
+    np.testing.assert_allclose(first.position_rad, joints.position_rad - 3 * STEP_S * 0.2)
+    np.testing.assert_allclose(first.velocity_rad_s, 2.0 * joints.velocity_rad_s)
+    np.testing.assert_allclose(first.acceleration_rad_s2, 4.0 * joints.acceleration_rad_s2)
+
+
+def test_velocities_of_a_slow_world_are_told_in_real_time() -> None:
+    driver = SimDriver(load_profile("panda_sim"))
+    part = driver.parts[""]
+    reference = part.reference
+    assert isinstance(reference, PoseReference)
+    run(driver, reference._replace(position_m=reference.position_m + [0.0, 0.0, 0.02]), 50)
+    driver.period_s = 2.0 * driver.steps * STEP_S
+    inside, told = driver.world.parts[""], part.measure()
+    assert told.joints.velocity_rad_s == pytest.approx(inside.joint_state().velocity_rad_s / 2)
+    assert told.pose.twist == pytest.approx(inside.pose_state(part.reference).twist / 2)
+    assert np.abs(told.pose.twist).max() > 0.01
+
+
+def test_of_a_world_that_diverged_the_last_finite_state_is_told() -> None:
+    driver = SimDriver(load_profile("panda_sim"))
+    Report(driver)
+    part = driver.parts[""]
+    run(driver, part.reference, 5)
+    known = part.measure()
+    driver.world._data.qpos[:] = np.nan
+    driver.fault = "the simulation diverged"
+    run(driver, part.reference, 1)
+    told = part.measure()
+    assert told.joints is known.joints
+    assert told.pose is known.pose
+
+
+def test_a_commanded_arm_is_reset_only_out_of_a_fault_and_then_stands_at_home() -> None:
+    with routed_session() as session:
+        profile = override(load_profile("panda_sim"), {"sim": {"seed": 4}})
+        node = RobotNode(SimDriver(profile, lockstep=True), session)
+        (arm,), driver = node.arms.values(), node.driver
+        assert isinstance(driver, SimDriver)
+        writer = StreamWriter(arm, "joint")
+
+        def steps(numbers: range) -> None:
+            for step in numbers:
+                session.put(*writer.command(step), attachment=writer.header(step))
+                node.step(Tick(1, step * STEP_NS, 0.0, 0.0))
+
+        steps(range(1, 100))
+        session.put(node.node.keys.sim_reset, "0")
+        steps(range(100, 150))
+        assert arm.guard.following
+        assert driver.world.seed == 4
+        assert any("reset_refused" in name for name in node.node.counters)
+        driver.fault = "the simulation diverged"
+        session.put(node.node.keys.sim_reset, "0")
+        node.step(Tick(1, 150 * STEP_NS, 0.0, 0.0))
+        assert driver.world.seed == 0
+        assert driver.fault == ""
+        assert not arm.guard.following
+        home_rad = driver.profile.robot.home_rad
+        np.testing.assert_allclose(arm.guard.reference.position_rad, home_rad, atol=1e-3)
+        node._close()
+
+
+def test_in_lockstep_a_part_of_a_millisecond_is_refused() -> None:
+    with routed_session() as session:
+        node = RobotNode(SimDriver(load_profile("panda_sim"), lockstep=True), session)
+        stop, key = Event(), node.node.keys.sim_step
+        thread = Thread(target=node.driver.serve_lockstep, args=(node, stop))
+        thread.start()
+        part = message.pack({"ns": 3 * STEP_NS // 2})
+        (refused,) = until("it answers", lambda: list(session.get(key, payload=part)))
+        assert refused.err is not None
+        (reply,) = session.get(key, payload=message.pack({"ns": 2 * STEP_NS}))
+        assert reply.ok is not None
+        assert message.unpack(reply.ok.payload.to_bytes())["time_ns"] == 2 * STEP_NS
+        stop.set()
+        thread.join()
+        node._close()
 
 
 @pytest.mark.parametrize(("mode", "name"), [("pose", "two_pandas_sim"), ("joint", "panda_sim")])
