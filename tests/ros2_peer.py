@@ -148,6 +148,7 @@ class KinematicPanda:
         self.width_m = 0.08
         self.goals: list[Any] = []
         self.goal_times_s: list[float] = []
+        self._followed: Any = None
         self.clock_ns = 0
         self.silent = self.frozen = False
         self.alter: Callable[[dict[str, Any]], None] = lambda fields: None
@@ -165,9 +166,10 @@ class KinematicPanda:
         return self._kinematics.forward(self.joints_rad).position_m
 
     def _follow(self) -> None:
-        if not self.goals:
+        if not self.goals or self.goals[-1] is self._followed:
             return
-        pose = self.goals[-1].pose
+        self._followed = self.goals[-1]
+        pose = self._followed.pose
         pose = getattr(pose, "pose", pose)
         at, turn = pose.position, pose.orientation
         goal = Pose(

@@ -30,7 +30,7 @@ extends: panda_ros2
 cameras:
   front: {{source: "ros2:{camera}", width: {width}, height: {height}, rate_hz: 60{depth_unit}}}
   wrist: null
-timing: {{command_timeout_s: 0.3, state_timeout_s: 0.5}}
+timing: {{command_timeout_s: 0.3, state_timeout_s: 0.5, command_hz: 100}}
 session: {{listen: [{endpoint}], connect: [{endpoint}]}}
 ros2:
   bridge: {bridge}
