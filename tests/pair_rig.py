@@ -92,7 +92,7 @@ class Pair:
     def __init__(self, motion: Motion, action: ActionSpec | None = None, seed: int = 0) -> None:
         world().reset()
         self.policy = Asked(motion, action or joint_steps())
-        self.loop = Lockstep(shipped(), world(), self.policy, reach=reach(), seed=seed)
+        self.loop = Lockstep(shipped(), world(), self.policy, reach=reach(), seed=seed, steps=2)
         self.commander = self.loop.commander
         self.path_m: dict[str, list[FloatArray]] = {part: [] for part in PARTS}
         self.least_m = self.least_measured_m = np.inf

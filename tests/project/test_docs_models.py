@@ -64,7 +64,7 @@ def height_m(loop: Lockstep) -> float:
 
 def test_the_model_lifts_the_arm(model: Path) -> None:
     policy, profile = make_policy(find_model(str(model))), load_profile("panda_sim")
-    loop = Lockstep(profile, build_world(profile), policy)
+    loop = Lockstep(profile, build_world(profile), policy, steps=2)
     loop.put("rate", RATE_HZ)
     loop.put("prompt", "wait")
     loop.run(1.1)

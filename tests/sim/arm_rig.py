@@ -108,6 +108,7 @@ def begin(
     others: dict[str, Asked] | None = None,
     bounded: bool = False,
     clear: bool = False,
+    steps: int = 2,
 ) -> Lockstep:
     """An active loop at home; the arm begins to move as `prompt` says.
 
@@ -119,13 +120,14 @@ def begin(
         others: more workers.
         bounded: by the arm's kinematics; where only steps and faults matter it just takes time.
         clear: the box is out of reach.
+        steps: of the world in a tick: as in the robot node, unless times are of a millisecond.
     """
     world = _world()
     world.reset()
     if clear:
         world.place("box", (0.5, 1.5, 0.0))
     reach = _shadow() if bounded else None
-    loop = Lockstep(shipped(), world, Asked(), reach=reach, others=others)
+    loop = Lockstep(shipped(), world, Asked(), reach=reach, others=others, steps=steps)
     loop.put("rate", rate_hz)
     loop.put("prompt", prompt)
     loop.run(READY_S)
@@ -133,9 +135,11 @@ def begin(
     return loop
 
 
-def moving(seconds: float = 1.0, prompt: str = UP, rate_hz: float = RATE_HZ) -> Lockstep:
+def moving(
+    seconds: float = 1.0, prompt: str = UP, rate_hz: float = RATE_HZ, *, steps: int = 2
+) -> Lockstep:
     """A loop whose arm is in full motion."""
-    loop = begin(prompt, rate_hz)
+    loop = begin(prompt, rate_hz, steps=steps)
     loop.run(seconds)
     assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
     return loop

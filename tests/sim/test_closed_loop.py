@@ -95,6 +95,7 @@ def begin(
         world,
         policy or make_policy(find_model("scripted"), options),
         delays=delays,
+        steps=2,
     )
     loop.run(0.2 + 1 / rate_hz)
     loop.put("active", True)

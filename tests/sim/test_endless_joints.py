@@ -84,7 +84,7 @@ def turned(
     profile = override(endless_arm(folder, **QUICK), {"robot": {"command": command}})
     world, reach = build_world(profile), ReachabilityFilter(profile)
     model = Turner(profile.robot.arm_joints, count * TURN / SPEED_RAD_S, **action)
-    loop = Lockstep(profile, world, model, reach=reach)
+    loop = Lockstep(profile, world, model, reach=reach, steps=2)
     assert loop.activate(1.0, 0.2) == ""
     loop.run(count * TURN / SPEED_RAD_S + 2.0)
     assert loop.commander.task.active, [event.why for event in loop.events]

@@ -79,7 +79,7 @@ class Keeps:
 
 
 def run(profile: Profile, world: World, policy: Keeps, seconds: float) -> None:
-    loop = Lockstep(profile, world, policy, delays=LATE, reach=ReachabilityFilter(profile))
+    loop = Lockstep(profile, world, policy, delays=LATE, reach=ReachabilityFilter(profile), steps=2)
     loop.put("rate", 5.0)
     loop.put("prompt", "hold it")
     loop.run(0.5)

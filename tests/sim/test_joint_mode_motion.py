@@ -27,7 +27,7 @@ def begin(prompt: str, posture: str = "start") -> Lockstep:
     world = build_world(of)
     # Activated in other joints than the home of the profile that the command node has.
     here = override(of, {"robot": {"home_rad": list(PROFILE.robot.home_rad)}})
-    loop = Lockstep(here, world, Asked(), reach=ReachabilityFilter(here))
+    loop = Lockstep(here, world, Asked(), reach=ReachabilityFilter(here), steps=2)
     loop.put("rate", 10.0)
     loop.put("prompt", prompt)
     loop.run(0.3)

@@ -114,7 +114,7 @@ def shadow() -> ReachabilityFilter:
 
 def begin(prompt: str) -> Lockstep:
     world().reset()
-    loop = Lockstep(PROFILE, world(), Upward(), reach=shadow())
+    loop = Lockstep(PROFILE, world(), Upward(), reach=shadow(), steps=2)
     loop.put("rate", RATE_HZ)
     loop.put("prompt", prompt)
     loop.run(0.3)

@@ -80,7 +80,7 @@ def test_late_chunks_cost_time_and_no_way() -> None:
 
 
 def test_chunks_that_are_too_late_are_nothing_and_the_arm_stops() -> None:
-    loop = moving()
+    loop = moving(steps=1)
     since = mark(loop)
     loop.tamper = delayed(1.2, ActionChunk)
     loop.run(1.9)
@@ -109,7 +109,7 @@ def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm() -> None
 
 @pytest.mark.long
 def test_chunks_from_the_future_are_nothing_and_the_arm_stops() -> None:
-    loop = moving()
+    loop = moving(steps=1)
     since = mark(loop)
     loop.tamper = early
     loop.run(0.7)
@@ -153,7 +153,7 @@ def test_commands_in_disorder_do_not_shake_the_arm() -> None:
 
 
 def test_a_heap_of_chunks_after_a_pause_is_not_made_up_for() -> None:
-    loop = moving()
+    loop = moving(steps=1)
     since = mark(loop)
     free_ns = loop.now_ns + 1_000_000_000
     loop.tamper = chunks_only(
@@ -183,7 +183,7 @@ def test_a_heap_of_chunks_after_a_pause_is_not_made_up_for() -> None:
 def test_a_clock_of_camera_or_worker_that_jumps_stops_the_arm_until_it_is_right(
     node: str, step_s: float
 ) -> None:
-    loop = moving()
+    loop = moving(steps=1)
     since = mark(loop)
     loop.set_clock(node, step_s)
     loop.run(0.45)
@@ -217,7 +217,7 @@ def test_a_clock_of_the_command_node_that_jumps_stops_the_arm(step_s: float) -> 
 def test_a_clock_of_the_robot_that_jumps_stops_the_arm(
     step_s: float, within: tuple[float, float]
 ) -> None:
-    loop = moving()
+    loop = moving(steps=1)
     since = mark(loop)
     loop.set_clock(SIM, step_s)
     loop.run(0.4)

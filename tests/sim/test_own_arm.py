@@ -42,7 +42,7 @@ def loop_of(file: Path) -> tuple[Lockstep, World]:
     world = build_world(slow)
     reach = ReachabilityFilter(slow)
     loop = Lockstep(
-        slow, world, make_policy(find_model("scripted"), profile=str(file)), reach=reach
+        slow, world, make_policy(find_model("scripted"), profile=str(file)), reach=reach, steps=2
     )
     return loop, world
 

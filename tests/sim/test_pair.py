@@ -121,7 +121,7 @@ def test_a_person_moves_one_arm_after_the_other() -> None:
     wish = OperatorInput()
     world().reset()
     policy = TeleopPolicy(shipped(), shipped().task.worker, lambda: wish, lambda: 2)
-    loop = Lockstep(shipped(), world(), policy, reach=reach())
+    loop = Lockstep(shipped(), world(), policy, reach=reach(), steps=2)
     loop.put("rate", 10.0)
     loop.run(0.5)
     loop.put("active", True)

@@ -51,6 +51,7 @@ def jumps_m(*, takes_committed: bool) -> np.ndarray:
         make_world(),
         Wavering(takes_committed=takes_committed),
         delays=LATE,
+        steps=2,
     )
     loop.put("rate", RATE_HZ)
     loop.put("prompt", "pass")

@@ -89,6 +89,8 @@ class Lockstep:
         picture: image of a camera, by name; None: small gray images with a little noise.
         reach: see `Commander`.
         others: more workers, by name; they run without effect until selected.
+        steps: of the world in a tick, all towards the reference of its end; the simulator's node
+            takes two.
     """
 
     def __init__(
@@ -102,8 +104,10 @@ class Lockstep:
         reach: ReachabilityFilter | Mapping[str, ReachabilityFilter] | None = None,
         seed: int = 0,
         others: Mapping[str, Policy] | None = None,
+        steps: int = 1,
     ) -> None:
         self.profile = profile
+        self._steps, self._tick_ns = steps, steps * TICK_NS
         self.world: Any = world
         self.delays = delays or Delays()
         self.now_ns = START_NS
@@ -115,7 +119,7 @@ class Lockstep:
                 self._arm(name).joint_range_rad,
                 np.full(len(profile.of_part(name).robot.arm_joints), np.inf),
                 self._arm(name).slides,
-                TICK_NS / 1e9,
+                self._tick_ns / 1e9,
             )
             for name in profile.part_names
         }
@@ -192,9 +196,9 @@ class Lockstep:
         """The wall clock of `node`."""
         return self.now_ns + self._clock_ns[node]
 
-    # -- one millisecond ----------------------------------------------------------------------
+    # -- one tick -----------------------------------------------------------------------------
     def _tick(self) -> None:
-        self.now_ns += TICK_NS
+        self.now_ns += self._tick_ns
         if self.now_ns >= self._next_state_ns:
             self._next_state_ns += round(1e9 / self.profile.timing.state_hz)
             self._publish_states()
@@ -217,7 +221,8 @@ class Lockstep:
             self._command()
         now_ns = self.wall_ns(SIM)
         references = {name: guard.tick(now_ns) for name, guard in self.guards.items()}
-        self.world.tick(references.get("", references))
+        more = () if self._steps == 1 else (self._steps,)  # what stands in for a world knows none
+        self.world.tick(references.get("", references), *more)
 
     def _arm(self, part: str) -> LockstepArm:
         return self.world.parts[part] if part else self.world
