@@ -12,12 +12,19 @@ from command_rig import DOWN, MS, START_M, START_NS, Rig, lone_chunk, profile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.actions import as_deltas, chunk_poses, covered_step
+from vla_zenoh.control.actions import Response, as_deltas, between, chunk_poses, covered_step
 from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
-from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, rotation_from_quat
+from vla_zenoh.kinematics.so3 import (
+    Pose,
+    angle_between,
+    exp3,
+    interpolate,
+    log3,
+    rotation_from_quat,
+)
 from vla_zenoh.policy import ActionSpec, ControllerSpec
 from vla_zenoh.profile.limits import Workspace
 from vla_zenoh.types import FloatArray, PoseState
@@ -187,6 +194,40 @@ def test_twenty_steps_of_osc_move_a_quarter_of_their_sum(amplitude: float, moved
     apart_mm = 1e3 * np.linalg.norm(ours - theirs, axis=1)
     assert np.percentile(apart_mm, 95) < 0.2
     assert ours[-1, 0] - START.position_m[0] == pytest.approx(moved_m, abs=1e-4)
+
+
+def test_a_turn_of_osc_is_pulled_by_the_sine_of_its_angle() -> None:
+    """robosuite's error of orientation: half the sum of cross products of the axes."""
+    row = np.array([0.0, 0.0, 0.0, 0.6, 0.0, 0.8])
+    wanted = OperationalSpaceController(START).step(row)
+    (reached,) = chunk_poses(spec(**OSC), osc_steps([row]), START)
+    assert angle_between(reached.rotation, wanted.rotation) < 1e-3
+
+
+def test_what_a_limit_cuts_off_of_a_response_is_cut_off_evenly_on_its_way() -> None:
+    action, step = spec(**OSC), np.array([0.05, -0.02, 0.0, 0.0, 0.3, 0.4])
+    asked, whole = covered_step(action, step, START, START, None)
+    assert whole is not None
+    after = interpolate(START, asked, 0.6)
+    cut = whole.stopped(asked, after)
+    end, last = between(START, after, cut, action.dt_s, 1.0)
+    np.testing.assert_allclose(matrix(end), matrix(after), atol=ATOL)
+    np.testing.assert_allclose(last.rate, cut.rate, atol=ATOL)
+    middle, _ = between(START, after, cut, action.dt_s, 0.5)
+    uncut, _ = between(START, asked, whole, action.dt_s, 0.5)
+    apart_m = middle.position_m - uncut.position_m
+    np.testing.assert_allclose(apart_m, (after.position_m - asked.position_m) / 2, atol=ATOL)
+
+
+@pytest.mark.parametrize(("speed", "left"), [(0.3, 0.0), (-0.3, -0.3)])
+def test_a_response_keeps_its_speed_where_it_comes_back_from_a_wall(
+    speed: float, left: float
+) -> None:
+    rate = np.array([speed, 0.2, 0.0, 0.0, 0.0, 0.1])
+    state = Response(ControllerSpec(kp=150.0), rate, np.eye(3), np.zeros(6), np.zeros(6))
+    asked = Pose(START.position_m + [0.01, 0.0, 0.0], START.rotation)
+    stopped = state.stopped(asked, START)
+    np.testing.assert_allclose(stopped.rate, [left, *rate[1:]], atol=ATOL)
 
 
 @pytest.mark.parametrize("ratio", [0.3, 0.999999999, 1.0, 1.000000001, 2.5])

@@ -93,6 +93,42 @@ def test_a_motion_that_is_told_its_target_again_goes_no_further(seed: int, veloc
     assert beyond_m <= TURN_M[velocity]
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_fast_axis_that_gets_less_acceleration_stops_before_either_end_of_its_range(
+    sign: float,
+) -> None:
+    motion = axes(1, within=2 * RANGE_M)
+    motion.move_to(np.array([sign * 2 * RANGE_M]))
+    for _ in range(70):
+        motion.advance(1.0)
+    motion.move_to(np.array([sign * 1.5 * RANGE_M]), Shares(0.5, 0.2, 0.2))
+    while motion.advance(1.0):
+        assert abs(motion.state.position[0]) <= 2 * RANGE_M + ROUNDING_M
+    assert motion.state.position[0] == pytest.approx(sign * 1.5 * RANGE_M)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_axis_outside_its_range_comes_in_within_its_share_of_the_limits(sign: float) -> None:
+    motion, share = axes(1, within=RANGE_M), 0.3
+    motion.stand(np.array([sign * 2 * RANGE_M]))
+    motion.move_to(np.zeros(1), Shares(share, share, share))
+    while motion.advance(1.0):
+        for most, value in zip(BOX, motion.state[1:], strict=False):
+            assert abs(value[0]) <= share * most * (1 + 1e-6)
+    assert motion.state.position[0] == pytest.approx(0.0)
+
+
+def test_halfway_to_rest_is_ahead_of_a_stop_that_is_nearly_over() -> None:
+    motion = axes(1)
+    motion.move_to(np.array([1.0]))
+    for _ in range(100):
+        motion.advance(1.0)
+    (end_m,) = motion.braked()
+    while motion.state.velocity[0] > 0.1 * BOX[0]:
+        motion.advance(1.0)
+    assert motion.state.position[0] < motion.halfway_to_rest()[0] < end_m
+
+
 def test_axes_stay_in_their_range_whatever_they_are_told_on_their_way() -> None:
     for seed in range(800, 840):
         rng = random.Random(seed)

@@ -135,7 +135,7 @@ def test_a_brake_ends_where_it_was_foretold_and_stays_there(
 @pytest.mark.parametrize("jerk", [0.02, 0.1, 1.0])
 def test_a_way_that_goes_on_with_little_jerk_gets_no_faster_than_it_may(jerk: float) -> None:
     motion = smoother()
-    goal = Pose(START.position_m + [0.4, 0.0, 0.0], START.rotation)
+    goal = Pose(START.position_m + [1.0, 0.0, 0.0], START.rotation)
     motion.target(goal)
     for _ in range(34):
         motion.tick()
