@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from motions import HOME_RAD, SCENE, line, make_world, still
 
+from vla_zenoh.robots.sim_driver import in_world_time
+from vla_zenoh.simulation.pace import MAX_STEPS
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import PREFIX, STEP_S
 from vla_zenoh.simulation.world import World
@@ -92,6 +95,16 @@ def test_a_smooth_swing_of_all_joints_is_followed(friction_nm: float) -> None:
     assert error.max() < FRICTION_LIMIT_RAD
     assert np.abs(world.joint_state().velocity_rad_s).max() < REST_RAD_S
     assert world.saturated == 0
+
+
+def test_it_is_followed_as_well_where_control_is_computed_as_rarely_as_ever() -> None:
+    world, worst_rad = make_world(), 0.0
+    path = swing(np.array(HOME_RAD), SWING_RAD, 2.0)
+    for reference in islice(path, MAX_STEPS - 1, None, MAX_STEPS):
+        world.tick(in_world_time(reference, 1.0, MAX_STEPS), MAX_STEPS)
+        error = np.abs(world.joint_state().position_rad - reference.position_rad)
+        worst_rad = max(worst_rad, float(error.max()))
+    assert worst_rad < FOLLOW_LIMIT_RAD
 
 
 def test_the_same_references_give_the_same_state_to_the_bit() -> None:

@@ -28,7 +28,7 @@ from vla_zenoh.kinematics.so3 import Pose, exp3
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
-from vla_zenoh.simulation.pace import CONTROL_STEPS, Pace
+from vla_zenoh.simulation.pace import Pace, control_steps
 from vla_zenoh.simulation.world import STEP_NS, STEP_S, build_world
 from vla_zenoh.types import Event, FloatArray, GripperCommand, ObjectPoses, SceneState
 from vla_zenoh.types.records import JointReference, JointState, PoseReference
@@ -93,7 +93,8 @@ class SimDriver(RobotDriver):
         self.world = build_world(profile)
         self.lockstep = lockstep
         self.modes = ("pose", "joint")
-        self.steps = 1 if lockstep else CONTROL_STEPS
+        self._on_time = control_steps(max(profile.timing.command_hz, profile.timing.state_hz))
+        self.steps = 1 if lockstep else self._on_time
         self.period_s = self.steps * STEP_S
         self.ticks = self.stamp_ns = 0
         self._pace: Pace | None = None
@@ -204,7 +205,7 @@ class SimDriver(RobotDriver):
     # -- time ---------------------------------------------------------------------------------
     def pace(self) -> Callable[[], Tick]:
         """Ticks on the monotonic clock; late ones follow each other at once."""
-        pace = self._pace = Pace(time.monotonic_ns())
+        pace = self._pace = Pace(time.monotonic_ns(), self._on_time)
         report = self.report
         report.counters["sim.overruns"] = 0
 
@@ -212,7 +213,7 @@ class SimDriver(RobotDriver):
             tick = pace.next(time.monotonic_ns())
             if tick.wait_ns > 0:
                 time.sleep(tick.wait_ns / 1e9)
-            if tick.steps > CONTROL_STEPS:
+            if tick.steps > self._on_time:
                 report.counters["sim.overruns"] += 1
             if tick.given_up_ns:
                 report.counters["sim.time_given_up_ms"] += tick.given_up_ns // 1_000_000

@@ -1,6 +1,7 @@
 """How a simulated world keeps to real time, and what gives way on a computer that is too slow.
 
-A tick computes control once and then steps the world. A late tick steps further than others, which
+A tick computes control once and then steps the world: at least twice from a command or state to
+the next, or every 4 ms where these are rare. A late tick steps further than others, which
 costs little: controllers and everything around them take most of the time. If that is not enough,
 simulated time slips: the world goes slower than real time. The arm still follows its commands at
 the time they are meant for: they are a path in real time, and in the time of the world that path is
@@ -15,7 +16,8 @@ from vla_zenoh.simulation.scene import STEP_S
 
 STEP_NS = round(STEP_S * 1e9)
 CONTROL_STEPS, MAX_STEPS = 2, 4
-"""Steps of the world for one computation of the controllers: on time, and at most."""
+"""Steps of the world for one computation of the controllers: on time at the shipped rates, and at
+most."""
 SLIP_AFTER_NS, SLIP_NS = 20_000_000, 20_000_000
 """Time slips if a tick is later than the first; by a factor of 2 if it is later than their sum."""
 MAX_STRETCH = 3.0
@@ -24,6 +26,11 @@ STRETCH_PER_STEP = 0.05
 GIVE_UP_NS = 100_000_000
 """A tick that is later still was a pause of the whole process: the world has stood still."""
 WINDOW_NS = 1_000_000_000
+
+
+def control_steps(rate_hz: float) -> int:
+    """Steps for one computation on time, where commands and states come at `rate_hz` at most."""
+    return min(max(int(1e9 / STEP_NS / (2 * rate_hz)), CONTROL_STEPS), MAX_STEPS)
 
 
 class PacedTick(NamedTuple):
@@ -50,13 +57,14 @@ class PacedTick(NamedTuple):
 
 
 class Pace:
-    """Ticks of a simulated world from `now_ns` on.
+    """Ticks of a simulated world from `now_ns` on, of so many `steps` on time.
 
     Attributes:
         factor: simulated over real time in the last full `WINDOW_NS`, 1.0 before the first.
     """
 
-    def __init__(self, now_ns: int) -> None:
+    def __init__(self, now_ns: int, steps: int = CONTROL_STEPS) -> None:
+        self._steps = steps
         self._time_ns = self._window_ns = now_ns
         self._stretch = 1.0
         self._stepped = 0
@@ -64,12 +72,12 @@ class Pace:
 
     def next(self, now_ns: int) -> PacedTick:
         """The next tick, asked for when the one before is over."""
-        late_ns = now_ns - self._time_ns - CONTROL_STEPS * STEP_NS
+        late_ns = now_ns - self._time_ns - self._steps * STEP_NS
         given_up_ns = late_ns if late_ns > GIVE_UP_NS else 0
         self._time_ns += given_up_ns
         late_ns -= given_up_ns
-        more = min(max(late_ns // STEP_NS, 0), MAX_STEPS - CONTROL_STEPS)
-        steps = CONTROL_STEPS + int(more)
+        more = min(max(late_ns // STEP_NS, 0), MAX_STEPS - self._steps)
+        steps = self._steps + int(more)
         self._follow(late_ns, steps)
         period_ns = round(steps * STEP_NS * self._stretch)
         self._time_ns += period_ns

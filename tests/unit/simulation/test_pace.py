@@ -18,14 +18,17 @@ from vla_zenoh.simulation.pace import (
     STRETCH_PER_STEP,
     Pace,
     PacedTick,
+    control_steps,
 )
 
 MS_NS = 1_000_000
 
 
-def run(cost_ns: Callable[[PacedTick], int], ticks: int) -> tuple[Pace, list[PacedTick], int]:
+def run(
+    cost_ns: Callable[[PacedTick], int], ticks: int, steps: int = CONTROL_STEPS
+) -> tuple[Pace, list[PacedTick], int]:
     """Ticks of a computer that needs `cost_ns` for each, and the time when they are over."""
-    pace, now_ns, found = Pace(0), 0, list[PacedTick]()
+    pace, now_ns, found = Pace(0, steps), 0, list[PacedTick]()
     for _ in range(ticks):
         tick = pace.next(now_ns)
         now_ns += max(tick.wait_ns, 0) + cost_ns(tick)
@@ -33,12 +36,20 @@ def run(cost_ns: Callable[[PacedTick], int], ticks: int) -> tuple[Pace, list[Pac
     return pace, found, now_ns
 
 
-def test_on_a_computer_that_keeps_up_simulated_time_is_real_time() -> None:
-    pace, ticks, _ = run(lambda _: MS_NS, 1500)
-    assert {(tick.steps, tick.stretch, tick.given_up_ns) for tick in ticks} == {
-        (CONTROL_STEPS, 1.0, 0)
-    }
+@pytest.mark.parametrize("steps", [CONTROL_STEPS, MAX_STEPS])
+def test_on_a_computer_that_keeps_up_simulated_time_is_real_time(steps: int) -> None:
+    pace, ticks, _ = run(lambda _: MS_NS, 1500, steps)
+    assert {(tick.steps, tick.stretch, tick.given_up_ns) for tick in ticks} == {(steps, 1.0, 0)}
     assert pace.factor == 1.0
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "steps"), [(1000.0, 2), (250.0, 2), (200.0, 2), (125.0, 4), (100.0, 4), (20.0, 4)]
+)
+def test_control_is_computed_twice_a_command_and_not_more_rarely_than_on_a_slow_computer(
+    rate_hz: float, steps: int
+) -> None:
+    assert control_steps(rate_hz) == steps
 
 
 def test_a_computer_that_is_too_slow_for_the_controllers_computes_them_less_often() -> None:
@@ -49,9 +60,14 @@ def test_a_computer_that_is_too_slow_for_the_controllers_computes_them_less_ofte
     assert max(tick.steps for tick in ticks) <= MAX_STEPS
 
 
-@pytest.mark.parametrize("factor", [0.8, 0.6, 0.4])
-def test_on_a_slower_computer_time_slips_evenly_and_nothing_is_given_up(factor: float) -> None:
-    pace, ticks, end_ns = run(lambda tick: round(tick.steps * STEP_NS / factor), 2000)
+@pytest.mark.parametrize(
+    ("factor", "steps"),
+    [(0.8, CONTROL_STEPS), (0.6, CONTROL_STEPS), (0.4, CONTROL_STEPS), (0.6, MAX_STEPS)],
+)
+def test_on_a_slower_computer_time_slips_evenly_and_nothing_is_given_up(
+    factor: float, steps: int
+) -> None:
+    pace, ticks, end_ns = run(lambda tick: round(tick.steps * STEP_NS / factor), 2000, steps)
     assert pace.factor == pytest.approx(factor, rel=0.05)
     assert not any(tick.given_up_ns for tick in ticks)
     latest_ns = SLIP_AFTER_NS + (1 / factor - 1) * SLIP_NS
