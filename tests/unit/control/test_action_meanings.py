@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_rig import DOWN, MS, START_M, START_NS, Rig, lone_chunk, profile
+from command_rig import DOWN, MS, START_M, START_NS, Rig, lone_chunk, profile, quat_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,6 +17,7 @@ from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
+from vla_zenoh.control.step_space import PoseSteps
 from vla_zenoh.kinematics.so3 import (
     Pose,
     angle_between,
@@ -437,6 +438,21 @@ def test_a_pose_from_the_future_says_nothing_about_the_past() -> None:
     ahead_ns = pose.received_ns + 1_000_000_000
     history.add(replace(pose, header=replace(pose.header, stamp_wall_ns=ahead_ns)))
     assert history.around(ahead_ns, 20_000_000) is None
+
+
+def test_a_pose_measured_between_two_states_is_between_theirs() -> None:
+    rig, history = Rig(), StateHistory[PoseState]()
+    steps = PoseSteps(rig.profile.limits, None, history, 50 * MS)
+    history.restart(rig.pose_state())
+    rig.now_ns += 20 * MS
+    rig.position_m = START_M + [0.01, 0.0, 0.0]
+    rig.quat_xyzw = quat_of([0.0, 0.0, 0.2])
+    history.add(rig.pose_state())
+    found = steps.measured(rig.now_ns - 15 * MS, 0.08)
+    assert found is not None
+    np.testing.assert_allclose(found.pose.position_m, START_M + [0.0025, 0.0, 0.0], atol=1e-9)
+    turned = log3(found.pose.rotation @ rotation_from_quat(DOWN).T)
+    np.testing.assert_allclose(turned, [0.0, 0.0, 0.05], atol=1e-9)
 
 
 @FEW

@@ -85,6 +85,10 @@ def test_a_larger_stop_takes_no_barrier_away(stop_m: float) -> None:
     barriers = Barriers(KINEMATICS, own, HOME_RAD)
     pairs = {str(pair) for pair in barriers.collisions.pairs}
     assert {str(pair) for pair in BASE.collisions.pairs} <= pairs
+    # Nor is there one that the arm cannot leave.
+    assert (barriers.stop[1:] < barriers.collisions.farthest_m).all()
+    assert (barriers.slow[1:] < barriers.collisions.farthest_m).all()
+    assert (barriers.stop <= barriers.slow).all()
 
 
 def test_an_upper_arm_near_the_table_has_a_barrier_to_it() -> None:

@@ -511,6 +511,27 @@ def test_the_goal_of_an_arm_that_is_held_is_on_its_way_and_no_further_than_it_ca
     np.testing.assert_allclose(turned, share * way_rad * turn, atol=1e-9)
 
 
+def test_the_goal_of_an_arm_that_is_held_near_a_face_of_its_box_is_inside_it() -> None:
+    path = PosePath(load_profile("panda_sim"))
+    _, high = workspace_corners(load_profile("panda_sim").limits)
+    path.reset(Pose(high - 0.001, START.rotation))
+    near = path.near(Goal(Pose(high + 0.1, START.rotation), 0.04)).pose
+    np.testing.assert_allclose(near.position_m, high, atol=1e-12)
+
+
+def test_the_way_to_a_goal_is_along_the_rates_of_a_motion_that_goes_there() -> None:
+    path = PosePath(load_profile("panda_sim"))
+    path.reset(START)
+    goal = Goal(Pose(START.position_m + [0.02, 0.05, 0.0], exp3([0.2, 0.3, 0.0])), 0.04)
+    path.go_to(goal)
+    for _ in range(20):
+        path.tick()
+    way, (rates, _) = path.way_to(goal), path.axis_rates()
+    for part in (slice(0, 3), slice(3, 6)):
+        along = way[part] @ rates[part] / norm3(way[part]) / norm3(rates[part])
+        assert along == pytest.approx(1.0, abs=1e-9)
+
+
 @pytest.mark.parametrize("speed", [1.0, 0.5])
 def test_a_pause_on_a_curved_way_ends_inside_the_box(speed: float) -> None:
     """No axis waits for another to stop, and passes the face that it was to stop at."""
