@@ -162,7 +162,6 @@ class AxisSmoother:
         self._target = self.state.position
         self._plan: AxisPlan | None = None
         self._elapsed_s = 0.0
-        self._jerk, self._sign = zeros, zeros
         self._planned_jerk = zeros
         """(n,) jerk limits that the motion in progress was planned with."""
         self._time_scale = 1.0
@@ -242,7 +241,7 @@ class AxisSmoother:
             self._plan = plan
 
     def _described(self, shares: Shares) -> str:
-        values = {**self.state._asdict(), "target": self._target, "jerk": self._jerk}
+        values = {**self.state._asdict(), "target": self._target, "jerk": self._planned_jerk}
         given = ", ".join(f"{name} {value.tolist()}" for name, value in values.items())
         return f"{given}, shares {[*shares]}, limits {self.box.tolist()}"
 
@@ -279,8 +278,6 @@ class AxisSmoother:
                 found = AxisPlan(self.state.position, basis, path, self._time_scale_of(most))
                 stop = basis, may_take, parts
                 if not (self._overshoots(found, along, stop) or self._leaves(found)):
-                    if most is not limits:
-                        self._jerk = most[2] / self.box[2]
                     self._planned_jerk = most[2]
                     return found, most is limits or most is unreversed
                 plan = plan if slowly and plan is not None else found
@@ -440,8 +437,7 @@ class AxisSmoother:
 
         The first ends every acceleration before its axis exceeds the velocity limit; with less
         jerk it would continue, to any speed. The second ends it before an axis that slows down
-        reverses, too. An axis keeps what it needed until its acceleration ends: with less again it
-        would pass its target.
+        reverses, too.
         """
         _, velocity, acceleration = self.state
         speed = np.abs(velocity)
@@ -449,11 +445,8 @@ class AxisSmoother:
         least = REST_VELOCITY * self._time_scale
         room = np.maximum(np.where(slows, speed, self.box[0] - speed), least)
         needed = np.minimum(acceleration**2 / (2 * room) / self.box[2], 1.0)
-        kept = np.where(acceleration * self._sign > 0.0, self._jerk, 0.0)
-        self._jerk = np.maximum(np.where(slows, 0.0, needed), kept)
-        self._sign = np.sign(acceleration)
         limits = self.box * np.array(shares)[:, None]
-        limits[2] = np.maximum(limits[2], self.box[2] * self._jerk)
+        limits[2] = np.maximum(limits[2], self.box[2] * np.where(slows, 0.0, needed))
         unreversed = limits.copy()
         unreversed[2] = np.maximum(limits[2], self.box[2] * needed)
         return limits, unreversed
