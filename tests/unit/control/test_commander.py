@@ -914,6 +914,34 @@ def test_the_plan_of_an_old_prompt_or_worker_runs_out_within_its_time_and_no_fur
     rig.assert_smooth()
 
 
+def test_no_episode_has_the_number_of_one_before_also_after_a_restart_or_a_clock_set_back() -> None:
+    rig, numbers = Rig(), [0]
+    for prompt, back_s in (("a", 0), ("b", 3600), ("c", 0)):
+        rig.now_ns -= back_s * 10**9
+        rig.put("prompt", prompt)
+        numbers.append(rig.commander.task.episode)
+    assert sorted(set(numbers)) == numbers
+    restarted = Rig()
+    restarted.now_ns += 4 * 10**9
+    restarted.put("prompt", "a")
+    assert restarted.commander.task.episode > numbers[-1]
+
+
+def test_chunks_that_were_held_up_while_the_arm_stood_replace_each_other() -> None:
+    rig = Rig(profile(timing={"max_observation_age_s": 2.0}))
+    rig.activate()
+    while rig.state == "active":
+        rig.tick()
+    rig.run(0.5)
+    for ago_s in (0.4, 0.25):
+        rig.send([UP] * 4, observed_ago_s=ago_s, published_ago_s=ago_s - 0.02)
+    assert rig.state == "active"
+    goal_m = rig.commands[-1].goal_position_m
+    np.testing.assert_allclose(goal_m, START_M + UP[:3], atol=AT_GOAL_M)
+    rig.settle()
+    np.testing.assert_allclose(rig.moved_m(), 4 * np.array(UP[:3]), atol=AT_GOAL_M)
+
+
 def test_the_same_prompt_again_is_no_new_episode() -> None:
     rig = moving_rig()
     task = rig.commander.task

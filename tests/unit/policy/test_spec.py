@@ -225,6 +225,12 @@ def test_a_spec_cannot_be_changed() -> None:
         (("observation", "cameras"), [{"camera": "a"}] * 2, "given once: a, a"),
         (("observation", "cameras"), [{"camera": "a", "width": 64}], "both width and height"),
         (("observation", "cameras"), [{"camera": "a", "resize": "pad"}], "'pad' needs width"),
+        (("observation", "depth"), [{"camera": "a"}] * 2, "given once: a, a"),
+        (
+            ("observation", "depth"),
+            [{"camera": "a", "near_m": 0.5, "far_m": 0.5}],
+            "must be more than near_m",
+        ),
         (("observation", "cameras"), [{}], "observation.cameras.0.camera: is missing"),
         (("observation", "cameras"), [{"camera": f"c{n}"} for n in range(17)], "at most 16"),
     ],
