@@ -11,7 +11,7 @@ from joint_rig import Joints
 from panda_arm import HOME_RAD, panda, tool_down_at
 
 from vla_zenoh.control.commander import Setting
-from vla_zenoh.control.reachability import NOISE, Barriers, ReachabilityFilter
+from vla_zenoh.control.reachability import NOISE, Barriers, Floors, ReachabilityFilter
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.collision import NEIGHBOURS_M, CollisionModel
 from vla_zenoh.kinematics.so3 import Pose
@@ -197,6 +197,15 @@ def test_a_violated_barrier_does_not_creep_in_many_small_steps() -> None:
         except StopIteration as last:
             pose = last.value.pose
     assert pose.position_m[2] > begin_m - 2 * NOISE
+
+
+def test_an_arm_that_was_pushed_further_beyond_a_barrier_may_leave_from_there() -> None:
+    floors, here = Floors(BASE), np.ones(len(BASE.stop))
+    for left_m, least_m in ((-0.01, -0.01), (-0.02, -0.02), (-0.015, -0.015), (-0.016, -0.016)):
+        here[1] = left_m
+        assert floors.after(here)[1] == pytest.approx(least_m, abs=2 * NOISE)
+    here[1] = -0.016 - NOISE / 2  # by itself it does not come nearer, in however many steps
+    assert floors.after(here)[1] == pytest.approx(-0.016 - NOISE, abs=NOISE / 10)
 
 
 # -- an arm that begins outside the box -----------------------------------------------------------

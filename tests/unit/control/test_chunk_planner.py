@@ -183,6 +183,20 @@ def test_until_a_chunk_is_bounded_the_one_before_it_stays_in_force() -> None:
     rig.assert_smooth()
 
 
+def test_a_chunk_that_is_hard_to_bound_is_in_force_after_some_ticks_as_far_as_it_is() -> None:
+    rig = arm_rig(profile(timing=OFTEN))
+    rig.run(0.3)
+    rig.send([UP] * 16)
+    rig.run(0.4)
+    out, waited = rig.send([DOWNWARDS] * 24, observed_ago_s=0.4), 0
+    while out.accepted is None:
+        out, waited = rig.tick(), waited + 1
+    assert waited == math.ceil(PATIENCE / rig.commander._planner.budget) - 1
+    plan = rig.commander.parts[0].motion.timeline
+    assert plan is not None
+    assert plan.plan.bounded < plan.plan.due_index(rig.now_ns) + 1
+
+
 def test_chunks_that_come_while_another_is_bounded_lose_no_step() -> None:
     rig = arm_rig(profile(timing=OFTEN), dt_s=0.02)
     rig.run(0.4)
@@ -314,6 +328,14 @@ def test_a_far_absolute_target_is_approached_straight_and_slowly() -> None:
         if away_m - gone @ direction > rig.profile.limits.step_m + 0.05:
             assert norm3(command.twist[:3]) <= fastest * (1 + 1e-6)
     rig.assert_smooth()
+
+
+def test_an_approach_is_no_faster_the_more_often_a_model_is_asked() -> None:
+    rig = absolute_rig()
+    go(rig, [*(START_M + [0.25, 0.0, 0.0]), *DOWN], 1.2, 0.02)
+    assert rig.moved_m()[0] < 0.2
+    fastest = max(norm3(command.twist[:3]) for command in rig.commands)
+    assert fastest <= rig.profile.limits.approach_m_s * (1 + 1e-6)
 
 
 def test_a_far_turn_is_approached_likewise() -> None:

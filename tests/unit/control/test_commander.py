@@ -942,6 +942,16 @@ def test_chunks_that_were_held_up_while_the_arm_stood_replace_each_other() -> No
     np.testing.assert_allclose(rig.moved_m(), 4 * np.array(UP[:3]), atol=AT_GOAL_M)
 
 
+def test_another_speed_drops_nothing_of_a_plan_that_runs() -> None:
+    rig = Rig(profile(timing={"max_observation_age_s": 0.5}))
+    rig.activate()
+    rig.send([UP] * 10)
+    rig.run(0.7)
+    rig.put("speed", 80.0)
+    rig.settle(2.0)
+    np.testing.assert_allclose(rig.moved_m(), 10 * np.array(UP[:3]), atol=AT_GOAL_M)
+
+
 def test_the_same_prompt_again_is_no_new_episode() -> None:
     rig = moving_rig()
     task = rig.commander.task

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from command_rig import Rig, profile
 
-from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.limits import LimitHit, in_steps
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.watchdog import JointMonitor
 from vla_zenoh.kinematics.kinematics import make_kinematics
@@ -72,6 +72,15 @@ def test_an_arm_that_comes_near_to_a_bound_is_slower_and_then_brakes_and_says_wh
     assert hit.where.startswith(where)
     assert hit.value < hit.limit
     assert limit is None or hit.limit == limit
+
+
+def test_towards_an_end_of_its_range_an_arm_has_the_speed_that_it_can_stop_from() -> None:
+    margin_rad, end_rad = LIMITS.reach.joint_margin_rad, KINEMATICS.lower_rad[3]
+    for margins, share in ((2.05, 1.0), (1.75, np.sqrt(0.75)), (1.5, np.sqrt(0.5))):
+        way_rad = end_rad + margins * margin_rad - HOME_RAD[3]
+        shares, hit = Watching().along(way_rad * JOINT["panda_joint4"])
+        assert hit is None
+        assert min(shares[-3:]) == pytest.approx(in_steps(float(share)), abs=0.051)
 
 
 def test_an_arm_that_stood_for_long_is_checked_again_as_soon_as_it_moves() -> None:

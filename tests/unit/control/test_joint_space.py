@@ -316,6 +316,28 @@ def test_a_step_into_a_barrier_is_cut_where_it_is_forbidden_and_not_dropped(
     assert bounded(share + 2.0**-STEP_HALVINGS).hits
 
 
+def test_a_step_of_joints_is_cut_by_the_limit_that_cuts_most_and_not_by_rounding() -> None:
+    profile, states = panda(), StateHistory[JointState]()
+    reach, action, limits = ReachabilityFilter(profile), Joints().rig.spec.action, profile.limits
+    bounds = JointBounds(profile, reach.kinematics, reach.barriers)
+    steps = JointSteps(bounds, reach, states, 0)
+    start = joint_goal(reach.kinematics, HOME_RAD, 0.0)
+
+    def cut(way_rad: FloatArray) -> tuple[float, float, set[str]]:
+        asked = joint_goal(reach.kinematics, HOME_RAD + way_rad, 0.0)
+        end, hits = steps.within_step(action.model_copy(update={"kind": "delta"}), start, asked)
+        return *steps.way(start, end)[:2], {hit.name for hit in hits}
+
+    for way_rad in (1.2 * np.eye(7)[0], 1.2 * np.eye(7)[6] + 0.1 * np.eye(7)[0]):
+        far_m, far_rad, hits = cut(way_rad)
+        assert far_m <= limits.step_m * (1 + 1e-6)
+        assert far_rad <= limits.step_rad * (1 + 1e-6)
+        assert hits
+    far_rad, hits = cut(float(np.float32(limits.step_rad)) * np.eye(7)[6])[1:]
+    assert far_rad == pytest.approx(limits.step_rad)
+    assert not hits
+
+
 def test_between_two_measurements_joints_are_where_they_were_by_then() -> None:
     profile, states, ms = panda(), StateHistory[JointState](), 1_000_000
     reach = ReachabilityFilter(profile)

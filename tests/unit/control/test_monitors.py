@@ -127,6 +127,18 @@ def test_the_arm_brakes_at_its_force_however_slowly_it_rises_and_whatever_was_th
         now_ns += step_ns
 
 
+@pytest.mark.parametrize("gap_s", [30.0, -30.0])
+def test_a_load_is_not_got_used_to_while_nothing_is_measured(gap_s: float) -> None:
+    contact, now_ns = Contact(ContactLimits(force_slow_n=20.0, force_stop_n=STOP_N)), START_NS
+    contact.update_pose(pressed(np.zeros(3), now_ns))
+    contact.begin()
+    now_ns += round(gap_s * 1e9)
+    for _ in range(50):
+        contact.update_pose(pressed(np.array([15.0, 0.0, 0.0]), now_ns))
+        now_ns += 4 * MS
+    assert contact.force_n == pytest.approx(15.0, abs=0.6)
+
+
 def test_an_arm_that_is_pressed_harder_than_the_stop_is_not_activated() -> None:
     contact = Contact(ContactLimits(force_stop_n=STOP_N))
     for tick in range(100):

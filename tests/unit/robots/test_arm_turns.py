@@ -103,6 +103,8 @@ class Turns:
     stall_s: float = 0.0
     """How late the next turn is."""
     state: str = "active"
+    behind_ns: int = 0
+    """By so much the clock of who leads it is behind."""
     stop: threading.Event = field(default_factory=threading.Event)
 
     @property
@@ -132,7 +134,8 @@ class Turns:
             SPEED_RAD_S * ramp_s / RAMP_S,
             SPEED_RAD_S / RAMP_S if time_s < RAMP_S else 0.0,
         )
-        header = Header(self.node.node.clock.wall_at(self.mono_ns), self.turn, "command#1")
+        stamp_ns = self.node.node.clock.wall_at(self.mono_ns) - self.behind_ns
+        header = Header(stamp_ns, self.turn, "command#1")
         self.session.put(
             self.node.node.keys.command_joint,
             records.encode(JointCommand(names, columns[0], columns[1], columns[2], self.state)),
@@ -236,6 +239,30 @@ def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(turns: Turns)
     assert (turns.turn - turns.last) * SLOW_S < 2 * LEAST_S
     (event,) = turns.told("not_braked")
     assert "the loop was late too often" in event.why
+
+
+@pytest.mark.parametrize("turns", ["timing: {state_hz: 100}"], indirect=True)
+def test_states_of_a_real_arm_are_published_no_more_often_than_the_profile_says(
+    turns: Turns,
+) -> None:
+    turns.run()
+    most = 100 * turns.turn * TICK_S
+    assert 0.7 * most < len(turns.heard[JointState]) <= most + 1
+
+
+def test_a_writer_whose_clock_is_set_back_in_motion_goes_on(turns: Turns) -> None:
+    turns.script[MOVING] = lambda: setattr(turns, "behind_ns", 3 * 10**9)
+    turns.run()
+    braked(turns)
+    assert turns.refused("joint_stale") == 0
+    assert np.abs(np.diff(turns.steps_rad)).max() < JERKED_RAD
+
+
+def test_no_stream_of_old_commands_begins(turns: Turns) -> None:
+    turns.behind_ns = 3 * 10**9
+    turns.run()
+    assert turns.refused("joint_stale") > MOVING
+    assert turns.arm.moves == []
 
 
 def test_over_an_ill_link_what_move_is_given_keeps_the_limits(turns: Turns) -> None:
