@@ -11,7 +11,14 @@ from pathlib import Path
 
 import pytest
 from camera_rig import free_endpoint, until
-from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
+from chain import (
+    COMMAND_HZ,
+    LONG_PATIENCE_S,
+    READY_PATIENCE_S,
+    STATE_HZ,
+    Chain,
+    command_line,
+)
 
 from vla_zenoh.bus.session import alive_nodes, open_session
 from vla_zenoh.errors import SessionError
@@ -24,7 +31,11 @@ UP_STEPS, UP_M, EXACT_M = 10, 0.1, 1e-3
 PROFILE = """\
 extends: {extends}
 session: {{listen: [{endpoint}], connect: [{endpoint}], lease_ms: 4000}}
-timing: {{command_timeout_s: {command}, state_timeout_s: {state}}}
+timing:
+  command_timeout_s: {command}
+  state_timeout_s: {state}
+  command_hz: {command_hz}
+  state_hz: {state_hz}
 {more}"""
 
 
@@ -32,7 +43,14 @@ def profile_of(folder: Path, extends: str, more: str = "") -> Path:
     path = folder / "wire.yaml"
     endpoint = free_endpoint()
     path.write_text(
-        PROFILE.format(extends=extends, endpoint=endpoint, more=more, **LONG_PATIENCE_S)
+        PROFILE.format(
+            extends=extends,
+            endpoint=endpoint,
+            more=more,
+            command_hz=COMMAND_HZ,
+            state_hz=STATE_HZ,
+            **LONG_PATIENCE_S,
+        )
     )
     return path
 

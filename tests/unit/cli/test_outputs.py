@@ -66,8 +66,15 @@ def test_a_stop_goes_on_whatever_becomes_of_its_output() -> None:
     assert said == dict.fromkeys(OUTPUTS, "")
 
 
-@pytest.mark.parametrize("output", OUTPUTS)
-@pytest.mark.parametrize("words", ["--version", "--help", "profile show panda_sim"])
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [
+        ("full disk", "--version"),
+        ("no reader", "--help"),
+        ("closed", "--version"),
+        *((output, "profile show panda_sim") for output in OUTPUTS),
+    ],
+)
 def test_other_commands_say_it_in_one_line_at_most(output: str, words: str) -> None:
     check_end(start(output, *words.split()), output)
 
