@@ -586,6 +586,14 @@ def test_a_stop_has_the_same_reason_whichever_node_tells_of_it_first(first: str)
     assert stops == ["emergency stop"]
 
 
+def test_what_is_refused_after_a_stop_does_not_replace_its_reason() -> None:
+    rig = moving_rig()
+    rig.tick("stop")
+    rig.put("active", True)
+    assert rig.refused["activate_refused"] == 1
+    assert (rig.state, rig.commander.why) == ("stopped", "emergency stop")
+
+
 def test_a_stop_and_a_chunk_in_one_tick_is_a_stop() -> None:
     rig = moving_rig()
     out = rig.tick("stop", chunks=[rig.chunk([UP])])

@@ -157,6 +157,17 @@ def test_a_wrench_that_stays_the_same_while_the_arm_moves_is_not_measured() -> N
     assert "no longer measures contact_force" in contact.lost
 
 
+def test_a_robot_that_reports_no_force_at_all_may_move_as_far_as_it_likes() -> None:
+    contact = Contact(ContactLimits())
+    contact.update_pose(pressed(np.zeros(3), START_NS))
+    contact.begin()
+    for tick in range(100):
+        state = pressed(np.zeros(3), START_NS + 4 * MS * tick)
+        at_m = START_M + [0.0, 0.0, 0.001 * tick]
+        contact.update_pose(replace(state, record=replace(state.record, position_m=at_m)))
+    assert contact.lost == ""
+
+
 class Felt(Rig):
     """An arm with a sensor of forces."""
 

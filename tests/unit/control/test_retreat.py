@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.commander_io import NewStates, Setting
-from vla_zenoh.control.contact import RELIEF_M, SPACE_M, CommandTrail
+from vla_zenoh.control.contact import RELIEF_M, SPACE_M, CommandTrail, Contact, Retreat
 from vla_zenoh.control.preflight import state_lost
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import Header, PoseState, Stamped
@@ -500,3 +500,23 @@ def test_a_pose_that_jumped_and_stays_there_is_not_trusted_without_kinematics() 
     rig.blocked = True  # it stays there
     rig.run(2.0)
     assert "jumped" in rig.commander.parts[0].states.doubt
+
+
+def test_it_does_not_return_to_where_a_person_has_pushed_the_arm_away_from_since() -> None:
+    limits = profile().limits
+    retreat, turned = Retreat(limits, Contact(limits.contact)), np.eye(3)
+
+    def at(x_m: float) -> Pose:
+        return Pose(START_M + [x_m, 0.0, 0.0], turned)
+
+    for x_m in np.arange(0.0, 0.051, 0.0025):
+        retreat.measure(at(float(x_m)))
+    retreat.begin(at(0.06))
+    retreat.measure(at(0.04))
+    places_m: list[float] = []
+    for tick in range(100):
+        target, _ = retreat.step(at(0.06), tick * 10 * MS, at_rest=True)
+        if target is not None:
+            places_m.append(float(target.position_m[0] - START_M[0]))
+    assert places_m[0] == max(places_m) == pytest.approx(0.04)
+    assert min(places_m) < 0.04 - RELIEF_M / 4

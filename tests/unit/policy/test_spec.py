@@ -21,12 +21,14 @@ from vla_zenoh.policy import (
     ROTATION_SIZE,
     ActionSpec,
     CameraSpec,
+    ControllerSpec,
     ModelSpec,
     Observation,
     ObservationSpec,
     StatePart,
     check_steps,
 )
+from vla_zenoh.policy.meaning import GripperScale
 from vla_zenoh.policy.observation import STATE_KINDS
 from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 
@@ -358,3 +360,29 @@ def test_an_example_has_the_prompt_it_was_given(prompt: str) -> None:
 def test_joints_have_no_scale_of_positions() -> None:
     with pytest.raises(ValueError, match="give joints in rad"):
         ActionSpec(horizon=1, dt_s=0.1, space="joint", joints=("a",), position_scale_m=0.01745)
+
+
+@pytest.mark.parametrize("threshold", [0.0, -0.0])
+def test_zero_and_minus_zero_are_the_same_threshold_on_the_wire(threshold: float) -> None:
+    action = ActionSpec(horizon=1, dt_s=0.1, gripper="binary", gripper_threshold=threshold)
+    assert '"gripper_threshold": 0.0' in json.dumps(ModelSpec(name="m", action=action).to_dict())
+
+
+@pytest.mark.parametrize(("threshold", "ends"), [(0.0, (-1.0, 1.0)), (0.5, (0.0, 1.0))])
+def test_a_binary_gripper_is_told_as_the_two_numbers_that_its_threshold_lies_between(
+    threshold: float, ends: tuple[float, float]
+) -> None:
+    action = ActionSpec(horizon=1, dt_s=0.1, gripper="binary", gripper_threshold=threshold)
+    for is_high, (shut, opened) in ((True, ends), (False, ends[::-1])):
+        told = action.model_copy(update={"gripper_open_is_high": is_high}).gripper_scale(0.08)
+        assert told == GripperScale(shut, opened)
+
+
+@pytest.mark.parametrize(
+    "other", [{"kind": "absolute"}, {"frame": "tcp"}, {"relative_to": "start"}]
+)
+def test_a_controller_covers_nothing_but_deltas_in_the_base_frame_one_after_the_other(
+    other: dict[str, Any],
+) -> None:
+    with pytest.raises(ValidationError, match="a controller covers deltas"):
+        ActionSpec(horizon=1, dt_s=0.1, controller=ControllerSpec(kp=150.0), **other)
