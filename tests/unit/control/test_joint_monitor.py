@@ -83,6 +83,22 @@ def test_towards_an_end_of_its_range_an_arm_has_the_speed_that_it_can_stop_from(
         assert min(shares[-3:]) == pytest.approx(in_steps(float(share)), abs=0.051)
 
 
+@pytest.mark.parametrize("joints_asked", [False, True])
+def test_only_an_arm_that_is_led_by_its_joints_may_come_near_to_a_singularity(
+    joints_asked: bool,
+) -> None:
+    watching, names = Watching(), set[str]()
+    for elbow_rad in np.linspace(-1.0, -0.2, 50):
+        joints_rad = np.array([0.0, 0.35, 0.0, elbow_rad, 0.0, 1.5, 0.785])
+        for _ in range(TICKS_A_LOOK):
+            watching.now_ns += TICK_NS
+            hit = watching.watch.update(
+                joints_rad, joints_rad, watching.now_ns, joints_asked=joints_asked
+            )
+            names |= {each.name for each in (hit, watching.watch.slowdown) if each is not None}
+    assert ("singularity" in names) is not joints_asked
+
+
 def test_an_arm_that_stood_for_long_is_checked_again_as_soon_as_it_moves() -> None:
     watching = Watching()
     assert watching.at(HOME_RAD, ticks=50 * TICKS_A_LOOK) is None

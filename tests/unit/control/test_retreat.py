@@ -512,11 +512,10 @@ def test_it_does_not_return_to_where_a_person_has_pushed_the_arm_away_from_since
     for x_m in np.arange(0.0, 0.051, 0.0025):
         retreat.measure(at(float(x_m)))
     retreat.begin(at(0.06))
-    retreat.measure(at(0.04))
+    retreat.measure(at(0.03))
     places_m: list[float] = []
     for tick in range(100):
         target, _ = retreat.step(at(0.06), tick * 10 * MS, at_rest=True)
         if target is not None:
             places_m.append(float(target.position_m[0] - START_M[0]))
-    assert places_m[0] == max(places_m) == pytest.approx(0.04)
-    assert min(places_m) < 0.04 - RELIEF_M / 4
+    assert places_m[0] == max(places_m) == pytest.approx(0.03)
