@@ -25,12 +25,14 @@ from vla_zenoh.types import Event, GripperState, Header, JointState, NodeStatus,
 
 CAMERA = "/camera/realsense2_camera/color/image_raw"
 WIDTH, HEIGHT = 64, 48
+COMMAND_HZ = 100
+"""Of a node that runs in real time."""
 PROFILE = """\
 extends: panda_ros2
 cameras:
   front: {{source: "ros2:{camera}", width: {width}, height: {height}, rate_hz: 60{depth_unit}}}
   wrist: null
-timing: {{command_timeout_s: 0.3, state_timeout_s: 0.5, command_hz: 100}}
+timing: {{command_timeout_s: 0.3, state_timeout_s: 0.5, command_hz: {command_hz}}}
 session: {{listen: [{endpoint}], connect: [{endpoint}]}}
 ros2:
   bridge: {bridge}
@@ -40,7 +42,12 @@ DEPTH = "/camera/aligned_depth_to_color/image_raw"
 
 
 def write_profile(
-    folder: Path, bridge: str = "ros2dds", more: str = "", *, depth: bool = False
+    folder: Path,
+    bridge: str = "ros2dds",
+    more: str = "",
+    *,
+    depth: bool = False,
+    command_hz: int = 250,
 ) -> Path:
     """A profile of a ROS 2 Panda with one small camera, on an address of its own.
 
@@ -51,6 +58,7 @@ def write_profile(
         PROFILE.format(
             bridge=bridge,
             endpoint=free_endpoint(),
+            command_hz=command_hz,
             camera=CAMERA,
             width=WIDTH,
             height=HEIGHT,
@@ -115,7 +123,8 @@ def ros2_rig(
     folder: Path, bridge: str = "ros2dds", more: str = "", *, depth: bool = False
 ) -> Iterator[Ros2Rig]:
     """The node, in a thread, and a kinematic Panda on the other side."""
-    profile = load_profile(str(write_profile(folder, bridge, more, depth=depth)))
+    path = write_profile(folder, bridge, more, depth=depth, command_hz=COMMAND_HZ)
+    profile = load_profile(str(path))
     with (
         open_session(profile.session, mode="router"),
         open_session(profile.session) as theirs,
