@@ -586,6 +586,16 @@ def test_a_stop_has_the_same_reason_whichever_node_tells_of_it_first(first: str)
     assert stops == ["emergency stop"]
 
 
+def test_a_robot_that_still_says_so_does_not_stop_an_arm_again_after_a_reset() -> None:
+    rig = Rig()
+    rig.gripper = replace(rig.gripper, mode="latched")
+    rig.tick()
+    assert rig.state == "stopped"
+    rig.put("reset")
+    rig.run(0.05)
+    assert rig.state == "inactive"
+
+
 def test_what_is_refused_after_a_stop_does_not_replace_its_reason() -> None:
     rig = moving_rig()
     rig.tick("stop")

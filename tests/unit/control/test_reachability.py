@@ -420,6 +420,14 @@ def test_what_was_cut_is_let_through_when_asked_for_itself() -> None:
     assert again is cut
 
 
+def test_joints_slow_no_step_that_takes_the_tcp_longer() -> None:
+    SHADOW.reset(HOME_RAD)
+    here = KINEMATICS.forward(HOME_RAD)
+    step = bounded(SHADOW, here, moved(here, 0.03 * UP, STILL), dt_s=1e-3)
+    assert step.hits == []
+    assert step.slowdown is None
+
+
 def test_the_same_questions_get_the_same_answers() -> None:
     first = walk(at(HOME_RAD), STEP_M * (UP + 0.3 * LEFT), 0.02 * ROLL, 40)
     joints = SHADOW.joints_rad

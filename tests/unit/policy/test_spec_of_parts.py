@@ -11,12 +11,12 @@ from vla_zenoh.policy.observation import state_names
 SIX = tuple(f"joint{i}" for i in range(6))
 
 
-def part(joints: tuple[str, ...] = SIX, horizon: int = 100) -> ActionSpec:
+def part() -> ActionSpec:
     return ActionSpec(
         space="joint",
-        joints=joints,
+        joints=SIX,
         kind="absolute",
-        horizon=horizon,
+        horizon=100,
         dt_s=0.02,
         gripper="open_fraction",
     )
@@ -49,9 +49,10 @@ def test_it_survives_the_wire() -> None:
     assert spec.parts == ("left", "right")
 
 
-def test_parts_have_the_same_steps() -> None:
+@pytest.mark.parametrize("other", [{"horizon": 50}, {"dt_s": 0.05}])
+def test_parts_have_the_same_steps(other: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="all parts of a chunk have the same"):
-        ActionSpec.of_parts({"left": part(), "right": part(horizon=50)})
+        ActionSpec.of_parts({"left": part(), "right": part().model_copy(update=other)})
 
 
 def test_the_states_of_every_part_are_observed() -> None:

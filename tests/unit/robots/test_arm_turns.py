@@ -329,8 +329,9 @@ def test_after_a_brief_stall_the_arm_is_given_its_last_set_point_at_rest_and_no_
 
 
 # -- what is raised ---------------------------------------------------------------------------
-def test_one_move_that_fails_brakes_the_arm_by_those_that_follow(turns: Turns) -> None:
-    turns.script[MOVING] = lambda: setattr(turns.arm, "failing", 1)
+@pytest.mark.parametrize("failing", [1, FAILURES])
+def test_moves_that_fail_brake_the_arm_by_those_that_follow(turns: Turns, failing: int) -> None:
+    turns.script[MOVING] = lambda: setattr(turns.arm, "failing", failing)
     with pytest.raises(NodeError, match=r"my_arm\.py: move: OSError: the cable is out"):
         turns.run()
     assert turns.turn < turns.last
