@@ -596,6 +596,15 @@ def test_a_robot_that_still_says_so_does_not_stop_an_arm_again_after_a_reset() -
     assert rig.state == "inactive"
 
 
+def test_an_arm_that_starves_on_a_busy_computer_says_so() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.tick(ticks=30)
+    while rig.state == "active":
+        rig.tick()
+    assert "this computer is too busy" in rig.commander.why
+
+
 def test_what_is_refused_after_a_stop_does_not_replace_its_reason() -> None:
     rig = moving_rig()
     rig.tick("stop")

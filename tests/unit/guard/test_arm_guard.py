@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_zenoh.guard.arm_guard import UNHEEDED_NS, ArmGuard, CommandKind, Measured
+from vla_zenoh.guard.arm_guard import UNHEEDED_NS, ArmGuard, CommandKind, HeldReference, Measured
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import STANDING, Header, JointCommand, PoseCommand, Stamped
@@ -299,3 +299,15 @@ def test_a_robot_that_was_reset_ignores_the_rest_of_the_stream_to_the_one_before
     side.guard.reset()
     assert side.pose(0.0, 0.0, state="stopped") == "inactive"
     assert not side.guard.following
+
+
+def test_a_reference_is_held_until_something_else_moves_a_joint_of_an_arm_that_rests() -> None:
+    held, still = HeldReference(np.zeros(2, bool)), np.zeros(2)
+    held.on_sent(0)
+    here = Measured(Pose(np.zeros(3), np.eye(3)), still, still)
+    for at_ms, elbow_rad, is_held in (
+        *((100, 0.5, True), (400, 0.1, True), (600, 0.0, True)),
+        *((700, 0.015, True), (800, 0.025, False), (900, 0.0, False)),
+    ):
+        moved = here._replace(position_rad=np.array([0.0, elbow_rad]))
+        assert held.update(moved, at_ms * 1_000_000) is is_held

@@ -619,3 +619,19 @@ def test_a_reset_that_was_put_before_a_stop_does_not_clear_it(turns: Turns, late
     assert turns.node.state in ("latched", "waiting")
     assert all(arm.stop_latched for arm in turns.node.arms.values())
     assert turns.refused("reset_refused") == 1
+
+
+@pytest.mark.parametrize(("waits_s", "clears"), [(0.1, False), (60.0, True)])
+def test_of_two_stops_the_one_that_was_put_last_counts_for_a_while(
+    turns: Turns, waits_s: float, clears: bool
+) -> None:
+    keys, session = turns.node.node.keys, turns.session
+    turns.script, turns.last = {}, 10**6
+    first, between, last = (session.new_timestamp() for _ in range(3))
+    for stamp in (last, first):
+        session.put(keys.stop, "stop", timestamp=stamp)
+        turns.node.step(turns.wait())
+    stand_still(turns, waits_s)
+    session.put(keys.reset, "reset", timestamp=between)
+    turns.node.step(turns.wait())
+    assert all(arm.stop_latched is not clears for arm in turns.node.arms.values())
