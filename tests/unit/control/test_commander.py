@@ -969,6 +969,32 @@ def test_chunks_that_were_held_up_while_the_arm_stood_replace_each_other() -> No
     np.testing.assert_allclose(rig.moved_m(), 4 * np.array(UP[:3]), atol=AT_GOAL_M)
 
 
+def test_after_a_pause_the_rest_of_a_chunk_that_has_become_old_is_dropped() -> None:
+    rig = Rig(profile(timing={"max_observation_age_s": 1.0}))
+    rig.activate()
+    rig.send([UP] * 16)
+    rig.run(0.3)
+    rig.put("speed", 0.0)
+    rig.run(1.5)
+    stood_m = rig.position_m.copy()
+    rig.put("speed", 100.0)
+    rig.run(1.0)
+    np.testing.assert_allclose(rig.position_m, stood_m, atol=AT_GOAL_M)
+    assert "paused" in {event.what for event in rig.events}
+
+
+def test_the_chunk_that_an_arm_was_activated_with_is_none_of_its_motion() -> None:
+    rig = Rig()
+    chunk = rig.chunk([UP], seq=7)
+    rig.tick(chunks=[chunk])
+    rig.put("active", True)
+    rig.tick(
+        chunks=[replace(chunk, record=replace(chunk.record, episode=rig.commander.task.episode))]
+    )
+    assert rig.refused == {"replayed": 1}
+    assert rig.send([UP], seq=8).accepted is not None
+
+
 def test_another_speed_drops_nothing_of_a_plan_that_runs() -> None:
     rig = Rig(profile(timing={"max_observation_age_s": 0.5}))
     rig.activate()
