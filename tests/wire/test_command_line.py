@@ -9,17 +9,18 @@ from typing import Any
 
 import pytest
 from camera_rig import free_endpoint
-from chain import LONG_PATIENCE_S, Chain, command_line
+from chain import COMMAND_HZ, LONG_PATIENCE_S, STATE_HZ, Chain, command_line
 from typed import Typed, typed
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile, override
+from vla_zenoh.simulation.pace import control_steps
 
 ROBOT_PATIENCE_S = LONG_PATIENCE_S
 REFUSED = 1
 AGAIN = 2
 RATE_TOLERANCE = 0.25
-CONTROL_HZ = 500
+CONTROL_HZ = 1000 / control_steps(max(COMMAND_HZ, STATE_HZ))
 """How often the simulated robot computes control, where the computer keeps up."""
 
 
