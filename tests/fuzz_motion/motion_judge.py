@@ -78,8 +78,9 @@ class Judge:
         self._at = np.array([i for i, tick in enumerate(ticks) if tick.record is not None], int)
         self._told: list[Tick] = [ticks[i] for i in self._at]
         self._time_s = np.array([(t.time_ns - ticks[0].time_ns) / 1e9 for t in self._told])
-        # Consecutive calls, of which the second goes on from the first.
-        anew = np.array([t.anchored and not t.followed for t in self._told], bool)
+        # Consecutive calls, of which the second goes on from the first. A command begins at the
+        # set-point that the robot tells, so a step from it to a false one is the robot's.
+        anew = np.array([t.anchored and (t.misled or not t.followed) for t in self._told], bool)
         self._goes_on = (np.diff(self._at) == 1) & ~anew[1:]
         self._states = np.array([t.state for t in self._told])
         self._active = self._states == "active"

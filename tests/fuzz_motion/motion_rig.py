@@ -75,6 +75,7 @@ class Tick(NamedTuple):
         state: afterwards.
         followed: the guard followed a stream before it.
         anchored: the arm was activated in it.
+        misled: the robot tells joints, and its set-point of them, of some time ago.
         record: the command, None: nothing was streamed.
         goal: the goal in force, None: none is.
         goal_rad: joints that it asks for, None: it is a pose.
@@ -86,6 +87,7 @@ class Tick(NamedTuple):
     state: str
     followed: bool
     anchored: bool
+    misled: bool
     record: Any
     goal: Pose | None
     goal_rad: Any
@@ -249,6 +251,7 @@ class Rig:
                 state,
                 followed,
                 before not in OBEYING and state in OBEYING,
+                self._lie is not None and self._lie.name == "joints frozen",
                 record,
                 goal.pose if goal is not None else None,
                 goal.joints_rad if isinstance(goal, JointGoal) else None,

@@ -66,18 +66,25 @@ def test_an_axis_that_leaves_its_goal_is_seen_and_one_that_follows_it_is_not() -
     assert wander(goal, place, still, still, on).max() == 0.0
 
 
-def test_a_step_in_a_command_is_seen_and_one_while_nobody_follows_is_not() -> None:
+def test_a_step_in_a_command_is_seen_but_not_where_nobody_follows_or_the_robot_misleads() -> None:
     case = make_case("pose", 1)
     trace = Rig(case).run(600)
     at = next(i for i, tick in enumerate(trace.ticks) if i > 300 and tick.record is not None)
     assert "command translation velocity" not in names(case, trace)
     whole = list(trace.ticks)
-    for anchored, followed, seen in ((False, True, True), (True, False, False)):
+    for anchored, followed, misled, seen in (
+        (False, True, False, True),
+        (True, True, False, True),
+        (True, False, False, False),
+        (True, True, True, False),
+        (False, True, True, True),
+    ):
         trace.ticks = [
             tick if i < at else tick._replace(record=moved(tick.record))
             for i, tick in enumerate(whole)
         ]
-        trace.ticks[at] = trace.ticks[at]._replace(anchored=anchored, followed=followed)
+        changed = {"anchored": anchored, "followed": followed, "misled": misled}
+        trace.ticks[at] = trace.ticks[at]._replace(**changed)
         assert ("command translation velocity" in names(case, trace)) is seen
 
 
