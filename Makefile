@@ -87,11 +87,12 @@ soak-fleet: $(READY) ## Run eight robots, an obeyed model and two in shadow with
 # Of ROS 2 itself the distribution jazzy and what is quick; everything with ALL=1.
 DISTRIBUTIONS := jazzy $(if $(ALL),kilted)
 RCLPY := rclpy$(if $(ALL),, and not slow)
+IN_ROS2 := $(or $(ARGS),tests/ros2)
 test-ros2: $(READY) ros2-bridge ros2-environment ## Run the tests with a real ROS 2 bridge, a DDS robot and ROS 2's rclpy; ALL=1 for all
-	$(BIN)/python -m pytest $(AGAIN) -m ros2 $(ARGS) || [ $$? = 5 ] || \
-		$(BIN)/python -m pytest $(AT_THE_END) -m ros2 $(ARGS)
-	ROS2_DISTRIBUTIONS="$(DISTRIBUTIONS)" $(BIN)/python -m pytest $(AGAIN) -m "$(RCLPY)" $(ARGS) || [ $$? = 5 ] || \
-		ROS2_DISTRIBUTIONS="$(DISTRIBUTIONS)" $(BIN)/python -m pytest $(AT_THE_END) -m "$(RCLPY)" $(ARGS)
+	$(BIN)/python -m pytest $(AGAIN) -m ros2 $(IN_ROS2) || [ $$? = 5 ] || \
+		$(BIN)/python -m pytest $(AT_THE_END) -m ros2 $(IN_ROS2)
+	ROS2_DISTRIBUTIONS="$(DISTRIBUTIONS)" $(BIN)/python -m pytest $(AGAIN) -m "$(RCLPY)" $(IN_ROS2) || [ $$? = 5 ] || \
+		ROS2_DISTRIBUTIONS="$(DISTRIBUTIONS)" $(BIN)/python -m pytest $(AT_THE_END) -m "$(RCLPY)" $(IN_ROS2)
 
 test-franka: $(READY) ## Run the tests of the driver franka against franka-sim, in an environment of its own
 	$(BIN)/python scripts/test_franka.py $(AGAIN) $(ARGS) || $(BIN)/python scripts/test_franka.py $(AT_THE_END) $(ARGS)

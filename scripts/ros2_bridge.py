@@ -107,7 +107,7 @@ def build() -> Path:
         )
     target = cache_folder()
     target.mkdir(parents=True, exist_ok=True)
-    say(f"building {PROGRAM} into {target} (once; some ten minutes on two processors)")
+    say(f"building {PROGRAM} into {target} (once; some five minutes on two processors)")
     with tempfile.TemporaryDirectory(dir=target, prefix="build-") as name:
         folder = Path(name)
         shutil.copytree(SOURCES, folder, dirs_exist_ok=True)
