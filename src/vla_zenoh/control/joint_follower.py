@@ -22,6 +22,8 @@ which it can stop before the end of its range, in whole ticks and within both li
 at its end is removed and the others continue without it. Towards a singularity all joints slow
 down so that the singular value s falls no faster than ``ka (s - s_stop)``, and than a stop of all
 joints together allows: an arm that slips through a singularity would come back in another branch.
+Of each near constraint (a face of the box, a distance) the greatest rate of approach from which it
+can be kept is computed; `nearest_velocities` keeps all of them at once.
 
 Damping: Nakamura, Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dyn.
 Sys. Meas. Control 108, 1986.
