@@ -240,6 +240,8 @@ class Rig:
         out = self.commander.step(inputs, self._now_ns, periods)
         self._check(at, plan_before, before, out, arrived=arrived)
         state = self.commander.state.value
+        # Deactivated and activated in one tick, it is, too.
+        anew = before not in OBEYING or any(e.what.startswith("inactive->") for e in out.events)
         for event in out.events:
             if event.what.endswith("->fault") and not event.why.startswith("the robot reports"):
                 self.trace.faults.append((at, event.why))
@@ -250,7 +252,7 @@ class Rig:
                 self._now_ns,
                 state,
                 followed,
-                before not in OBEYING and state in OBEYING,
+                anew and state in OBEYING,
                 self._lie is not None and self._lie.name == "joints frozen",
                 record,
                 goal.pose if goal is not None else None,
