@@ -84,7 +84,7 @@ def test_make_alone_lists_the_targets() -> None:
 def test_ci_runs_what_people_run() -> None:
     lines = (ROOT / ".ci" / "run").read_text().splitlines()
     assert "make check test test-ros2 test-franka build" in lines
-    assert lines[-1].startswith("make soak MINUTES=3 ")
+    assert lines[-1].startswith("make soak MINUTES=2 ")
 
 
 def test_what_is_imported_from_the_package_is_there() -> None:
