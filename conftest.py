@@ -18,9 +18,9 @@ from hypothesis import settings
 from yaml_once import remember_yaml
 
 # Machines that run tests are slow now and then: time per example says nothing about the code. The
-# same examples every time, so that a failure is that of the change; new ones, and twice as many,
-# are searched for by `make slow`.
-settings.register_profile("default", deadline=None, derandomize=True, max_examples=50)
+# same examples every time, so that a failure is that of the change; new ones are searched for by
+# `make slow`.
+settings.register_profile("default", deadline=None, derandomize=True)
 settings.register_profile("searching", deadline=None)
 settings.register_profile("thorough", deadline=None, max_examples=2000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
