@@ -45,11 +45,14 @@ def check_size(sample: zenoh.Sample, limit: int) -> None:
         raise CodecError("oversize", f"{size} bytes, at most {limit} are accepted")
 
 
-def header_of(sample: zenoh.Sample) -> Header:
-    """Header of a sample; `CodecError`: there is none that can be decoded."""
+def header_of(sample: zenoh.Sample, unknown: list[str] | None = None) -> Header:
+    """Header of a sample; `CodecError`: there is none that can be decoded.
+
+    `unknown`: gets the names of fields that this version does not know.
+    """
     attachment = sample.attachment
     given = None if attachment is None else bytes_of(attachment, records.MAX_HEADER_BYTES)
-    return records.decode_header(given)
+    return records.decode_header(given, unknown)
 
 
 class ReceivedSample(NamedTuple):

@@ -371,20 +371,18 @@ class Node:
         kind: type[Record],
         arrival: ReceivedSample,
         writer_filter: SingleWriterFilter | None = None,
-        header: Header | None = None,
         read: Callable[[zenoh.Sample], Record] | None = None,
     ) -> Stamped[Record] | None:
         """Decode a sample, with its stamps on this node's clock, see `ClockSync`.
 
-        None if it was rejected, which is counted and reported. `header`: if it is decoded already;
-        `read`: decodes what is no record of msgpack.
+        None if it was rejected, which is counted and reported. `read`: decodes what is no record of
+        msgpack.
         """
-        key = str(arrival.sample.key_expr)
+        key, unknown = str(arrival.sample.key_expr), list[str]()
         try:
-            header = header or header_of(arrival.sample)
+            header = header_of(arrival.sample, unknown)
             if writer_filter is not None:  # first: a flood by another source must cost little
                 writer_filter.check(header, arrival.mono_ns)
-            unknown = records.unknown_header_fields(bytes_of(arrival.sample.attachment))
             if read is None:
                 record = records.decode(kind, bytes_of(arrival.sample.payload), unknown)
             else:

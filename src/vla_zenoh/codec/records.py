@@ -47,7 +47,12 @@ def decode(kind: type[Record], payload: bytes, unknown: list[str] | None = None)
     if _is_spec(kind):
         _check_length(kind, payload, MAX_SPEC_BYTES)
         return _spec(kind, message.unpack(payload))
-    fields = message.fields_of(kind.__name__, payload)
+    return _decode(kind, message.fields_of(kind.__name__, payload), payload, unknown)
+
+
+def _decode(
+    kind: type[Record], fields: Mapping[str, Raw], payload: bytes, unknown: list[str] | None
+) -> Record:
     form = form_of(kind)
     _check_names(form, fields, unknown)
     try:
@@ -105,28 +110,22 @@ def encode_header(header: Header) -> bytes:
     return message.pack({"schema": keys.SCHEMA, **{n: getattr(header, n) for n in _HEADER.names}})
 
 
-def decode_header(attachment: bytes | None) -> Header:
-    """Read an attachment.
+def decode_header(attachment: bytes | None, unknown: list[str] | None = None) -> Header:
+    """Read an attachment; for `unknown` see `decode`.
 
     Raises:
         CodecError: ``no_header``, ``malformed``, ``schema`` for another version, or ``invalid`` for
-            a value out of range. Fields that a later version may add are ignored.
+            a value out of range.
     """
     if attachment is None:
         raise CodecError("no_header", "the sample has no attachment; streams carry a header there")
     if len(attachment) > MAX_HEADER_BYTES:
         raise CodecError("malformed", f"a header of {len(attachment)} bytes")
     fields = message.fields_of("the header", attachment)
-    schema = message.unpack(bytes(fields["schema"])) if "schema" in fields else None
+    schema = message.unpack(bytes(fields.pop("schema"))) if "schema" in fields else None
     if type(schema) is not int or schema != keys.SCHEMA:
         raise CodecError("schema", _other_version(schema))
-    return decode(Header, attachment)
-
-
-def unknown_header_fields(attachment: bytes) -> list[str]:
-    """Names of the fields of a decoded header that this version does not know."""
-    fields = message.fields_of("the header", attachment)
-    return _unknown(_HEADER, {name: raw for name, raw in fields.items() if name != "schema"})
+    return _decode(Header, fields, attachment, unknown)
 
 
 def _other_version(schema: Any) -> str:

@@ -63,7 +63,7 @@ class FrozenImages:
     ) -> str:
         arms = tuple(seen.parts.values()) or (seen,)
         before = self._shown.get((kind, camera))
-        if before is None or not np.array_equal(before.pixels, pixels):
+        if before is None or not _same(before.pixels, pixels):
             self._shown[kind, camera] = _Shown(pixels, seen.stamp_wall_ns, arms)
             return ""
         lasted_s = (seen.stamp_wall_ns - before.since_ns) / 1e9
@@ -77,6 +77,11 @@ class FrozenImages:
             f"than {limit_s:g} s is allowed (cameras.{camera}.check.same_s; 0 where it does not "
             "see the arm)"
         )
+
+
+def _same(before: Any, now: Any) -> bool:
+    """Whether images agree; of most that do not, one row in sixteen says so."""
+    return np.array_equal(before[::16], now[::16]) and np.array_equal(before, now)
 
 
 def _moved(then: Observation, now: Observation) -> bool | None:

@@ -155,7 +155,7 @@ class CommandInputs:
         except CodecError as error:
             self._node.reject(error.reason, f"delta/{worker}: {error}")
             return None
-        chunk = self._node.decode(ActionChunk, arrival, header=header)
+        chunk = self._node.decode(ActionChunk, arrival)
         if chunk is not None and chunk.record.worker != worker:
             self._node.reject("foreign", "chunk on the delta key of another worker")
             return None
@@ -327,7 +327,7 @@ class PeerMonitor:
         if source.startswith(ON_BEHALF) or (not alive and name in self._expected):
             self._receive_on_behalf(name, arrival, header)
             return
-        stamped = self._node.decode(NodeStatus, arrival, header=header) if ours else None
+        stamped = self._node.decode(NodeStatus, arrival) if ours else None
         if ours and stamped is None:
             return  # rejected and counted already
         status = stamped.record if stamped is not None and stamped.record.node == name else None
@@ -351,7 +351,7 @@ class PeerMonitor:
     def _receive_on_behalf(self, name: str, arrival: ReceivedSample, header: Header) -> None:
         """Keep why a node is down, as its host's `up` reports it, or the command of a worker that
         was started by hand; for display only."""
-        stamped = self._node.decode(NodeStatus, arrival, header=header)
+        stamped = self._node.decode(NodeStatus, arrival)
         why = None if stamped is None else stamped.record.detail.get("complaint")
         if stamped is None or stamped.record.state != CRASHED or not isinstance(why, str):
             return
@@ -373,7 +373,7 @@ class PeerMonitor:
             if ours and known is None and len(self._specs) >= MAX_WORKERS:
                 self._node.counters["refused.more_workers"] += 1
                 return
-        stamped = self._node.decode(ModelSpec, arrival, header=header) if ours else None
+        stamped = self._node.decode(ModelSpec, arrival) if ours else None
         if ours and stamped is None:
             return
         with self._lock:
