@@ -59,8 +59,9 @@ EVALUATIONS_1_S = 1500.0
 """Evaluations of the arm per second of ticks."""
 PATIENCE = 24
 """After this many evaluations a plan comes into force with the steps bounded so far."""
-LOOK_AHEAD = 8
-"""Steps bounded before they are due."""
+LOOK_AHEAD_NS = 50_000_000
+"""Steps due within this time are bounded before they are: one at a limit takes 7 ms of ticks. Those
+after it would mostly be bounded again, since every cut by the leash shifts them."""
 BEHIND_S = 0.3
 """At the end of an approach the arm is up to this late."""
 OVERTAKEN = Rejection("overtaken", "a newer chunk came before it was planned", quiet=True)
@@ -399,8 +400,8 @@ class ChunkPlanner:
                 raise self._rejected(Rejection(acted[0].name, why, *acted[0][1:3]))
         return True
 
-    def bound_due(self, plans: Sequence[Plan], now_ns: int, ahead: int = 0) -> list[LimitHit]:
-        """Bound the steps of `plans` (the newest last) that are due, and `ahead` steps after them.
+    def bound_due(self, plans: Sequence[Plan], now_ns: int, ahead_ns: int = 0) -> list[LimitHit]:
+        """Bound the steps of `plans` (the newest last) that are due, and those of `ahead_ns` more.
 
         Later goals move with what is cut off. Returns the limits that acted since the last call.
         """
@@ -409,7 +410,7 @@ class ChunkPlanner:
             due = plan.due_index(now_ns)
             if plan.action.targets and plan.bounded > due:
                 plan.computed = plan.bounded  # the leash does not shift targets
-            until = min(due + 1 + ahead, len(plan.goals))
+            until = min(due + 1 + math.ceil(ahead_ns / plan.dt_ns), len(plan.goals))
             while plan.bounded < until and self._bound_step(plan) is not None:
                 pass
         return [hit for plan in chunks for hit in plan.unreported_hits()]

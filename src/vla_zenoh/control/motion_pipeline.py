@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
+from vla_zenoh.control.chunk_planner import LOOK_AHEAD_NS, ChunkPlanner
 from vla_zenoh.control.commander_io import limit_events, make_event
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
@@ -360,7 +360,7 @@ class MotionPipeline:
         # Later steps can wait for a tick that plans no motion, which takes as long as they do.
         self._looks_ahead = not (plans_motion and self._looks_ahead)
         if self._looks_ahead:
-            events += limit_events(self._planner.bound_due(plans, now_ns, LOOK_AHEAD))
+            events += limit_events(self._planner.bound_due(plans, now_ns, LOOK_AHEAD_NS))
         return events
 
     def _shorten(self, plans: Sequence[Plan], goal: Goal, cut: Goal, now_ns: int) -> Goal:
