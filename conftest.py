@@ -108,8 +108,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if _is_lent_a_robot(item):
             kills = item.path.parent.name == KILLS
             robots_s[item.path] = _patience_s(item)["command"], kills
-    # Files that can go on with the same robot follow each other.
-    items.sort(key=lambda item: robots_s.get(item.path, (0.0, False)))
+    # Files that can go on with the same robot follow each other; those of whole robots are the
+    # longest row, so they begin at once.
+    items.sort(
+        key=lambda item: (
+            item.path.parent.name not in WHOLE_ROBOTS,
+            robots_s.get(item.path, (0.0, False)),
+        )
+    )
 
 
 @pytest.hookimpl(tryfirst=True)  # before the fixtures are made
