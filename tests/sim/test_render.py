@@ -90,12 +90,13 @@ def test_the_whole_arm_is_in_the_front_picture_when_it_is_raised(rays: Renderer)
     from scripts.home_pose import solve_home
 
     world = make_world()
-    empty = rays.render("front", *SIZE)
+    rays.set_qpos(world.qpos())
+    before = rays.render("front", *SIZE)
     raised = world.qpos()
     first = world.model.joint("robot/panda_joint1").qposadr[0]
     raised[first : first + 7] = solve_home(SCENE, RobotModel(), (0.43, 0.0, 0.70))
     rays.set_qpos(raised)
-    changed = (rays.render("front", *SIZE) != empty).any(axis=-1)
+    changed = (rays.render("front", *SIZE) != before).any(axis=-1)
     rows, columns = np.nonzero(changed)
     assert rows.min() > 5
     assert columns.min() > 5
