@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import os
 import platform
 import random
@@ -137,25 +138,27 @@ def measure(way: ServingWay, load: Load, seed: int) -> Interval:
     Raises:
         NodeError: it does not start, dies, or leaves too many requests unanswered.
     """
-    pictures, requests = load.pictures(), load.requests
+    # No camera shows the same image twice.
+    pictures, requests = [load.pictures(0), load.pictures(1)], load.requests
+    shown = itertools.cycle(pictures)
     draw = random.Random(seed)
     pause_s = (0.0, 0.0) if way.kind != "chain" else (1 / RATE_HZ, 1 / RATE_HZ)
     if load.pause:
         pause_s = PERIOD_S
     figures: dict[str, list[float]] = defaultdict(list)
-    with _START[way.kind](way, pictures) as running:
+    with _START[way.kind](way, pictures[0]) as running:
         for _ in range(WARM_UP):
-            _paced(running, pictures, draw.uniform(*pause_s))
+            _paced(running, next(shown), draw.uniform(*pause_s))
         gc.collect()
         standing = _spent_in(running, lambda: _stay_awake(running))
         # The first request after the pause is not measured.
-        _paced(running, pictures, draw.uniform(*pause_s))
+        _paced(running, next(shown), draw.uniform(*pause_s))
         lost = 0
 
         def ask_all() -> None:
             nonlocal lost
             for _ in range(requests):
-                got = _paced(running, pictures, draw.uniform(*pause_s))
+                got = _paced(running, next(shown), draw.uniform(*pause_s))
                 if got is None:
                     lost += 1
                     if lost > MAX_LOST:

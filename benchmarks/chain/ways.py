@@ -53,9 +53,9 @@ class Load:
     cameras: int = 1
     pause: bool = True
 
-    def pictures(self) -> Pictures:
+    def pictures(self, seed: int = 0) -> Pictures:
         """Images of a request."""
-        return [noisy_picture(*self.size)] * self.cameras
+        return [noisy_picture(*self.size, seed)] * self.cameras
 
 
 WAYS = (
