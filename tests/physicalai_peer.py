@@ -15,8 +15,8 @@ import numpy as np
 import zenoh
 
 SO101 = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
-PORT_OF_FOLLOWER, PORT_OF_ARM = 56572, 38977
-"""Of the robots ``follower`` and ``arm``, as physicalai itself derives them."""
+PORT_OF_ARM_2, PORT_OF_ARM_3 = 23_064, 25_196
+"""Of the robots ``arm_2`` and ``arm_3``: Linux gives ports this low to nobody who does not ask."""
 
 
 def packed(values: Any, dtype: str = "float32") -> dict[str, Any]:
@@ -43,7 +43,7 @@ class Owner:
     What `said` has replaces fields of each state, `metadata` those of the reply; None removes one.
     """
 
-    def __init__(self, name: str, port: int = PORT_OF_FOLLOWER, **metadata: Any) -> None:
+    def __init__(self, name: str, port: int = PORT_OF_ARM_2, **metadata: Any) -> None:
         self.name, self.key = name, f"physicalai/robot/{name}"
         self.at = np.array([0.0, -20.0, 20.0, 10.0, 0.0, 30.0])
         self.said: dict[str, Any] = {}

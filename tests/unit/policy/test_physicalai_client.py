@@ -11,7 +11,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from physicalai_peer import PORT_OF_ARM, SO101, Client, unpacked
+from physicalai_peer import PORT_OF_ARM_3, SO101, Client, unpacked
 
 from vla_zenoh.errors import PeerError, WorkerError
 from vla_zenoh.lab.check.examples import example_observation
@@ -31,7 +31,9 @@ pytestmark = pytest.mark.realtime
 
 
 def made(**options: str) -> Any:
-    return make_policy(find_model("physicalai_client"), {"profile": "so101_sim", **options})
+    return make_policy(
+        find_model("physicalai_client"), {"profile": "so101_sim", "name": "arm_3", **options}
+    )
 
 
 def seen(policy: Any, width_m: float = 0.04) -> Observation:
@@ -48,7 +50,7 @@ class Pair:
         self.policy = made()
         self.policy.load()
         self.policy.reset()
-        self.client = Client("arm", PORT_OF_ARM)
+        self.client = Client("arm_3", PORT_OF_ARM_3)
 
     def state(self) -> dict[str, Any]:
         """A state, as the client gets it."""
@@ -96,7 +98,7 @@ def pair() -> Iterator[Pair]:
 def test_a_client_finds_the_arm_and_its_state(pair: Pair) -> None:
     assert pair.client.metadata() | {"host": ""} == {
         "protocol_version": 1,
-        "name": "arm",
+        "name": "arm_3",
         "robot_class": "vla_zenoh.normalised",
         "host": "",
         "joint_names": list(SO101),
@@ -121,7 +123,7 @@ def test_an_action_is_the_step_it_asks_for(pair: Pair) -> None:
 def test_without_an_action_there_is_no_answer(pair: Pair) -> None:
     answer = pair.answer()
     assert isinstance(answer, str)
-    assert "silent: no client of 'arm' put a valid action in the last 0.5 s" in answer
+    assert "silent: no client of 'arm_3' put a valid action in the last 0.5 s" in answer
 
 
 def test_a_client_that_falls_silent_is_obeyed_no_longer(pair: Pair) -> None:
@@ -159,7 +161,7 @@ def test_a_wrong_action_is_told_and_moves_nothing(
 
 
 def test_two_owners_of_one_name_are_told_apart(pair: Pair) -> None:
-    with pytest.raises(WorkerError, match=f":{PORT_OF_ARM} is taken: does another owner"):
+    with pytest.raises(WorkerError, match=f":{PORT_OF_ARM_3} is taken: does another owner"):
         made().load()
 
 
@@ -177,7 +179,7 @@ def test_options_are_checked() -> None:
 def test_the_driver_and_the_worker_mean_the_same(pair: Pair, tmp_path: Path) -> None:
     """Our driver as the client of our worker: what it reads is where the arm is."""
     path = tmp_path / "lab.yaml"
-    path.write_text("extends: so101_physicalai\nphysicalai: {name: arm}\n")
+    path.write_text("extends: so101_physicalai\nphysicalai: {name: arm_3}\n")
     driver = PythonDriver(load_profile(str(path)))
     driver.connect()
     pair.answer()

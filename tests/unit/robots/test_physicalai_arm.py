@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from driver_rig import DriverRig
-from physicalai_peer import PORT_OF_FOLLOWER, SO101, Client, Owner, packed, unpacked
+from physicalai_peer import PORT_OF_ARM_2, SO101, Client, Owner, packed, unpacked
 from vla_zenoh_physicalai import wire
 
 from vla_zenoh.errors import CodecError, NodeError, ProfileError
@@ -31,7 +31,7 @@ class Rig(DriverRig):
 
     soon_s = SOON_S
 
-    def __init__(self, folder: Path, options: str = "name: follower") -> None:
+    def __init__(self, folder: Path, options: str = "name: arm_2") -> None:
         super().__init__(folder, PROFILE.format(options=options))
 
     def measured(self) -> Any:
@@ -51,7 +51,7 @@ class Rig(DriverRig):
 
 @pytest.fixture
 def owner() -> Iterator[Owner]:
-    with Owner("follower") as owner:
+    with Owner("arm_2") as owner:
         yield owner
 
 
@@ -63,10 +63,10 @@ def rig(owner: Owner, tmp_path: Path) -> Iterator[Rig]:
     rig.driver.close()
 
 
-def refused(folder: Path, why: str, options: str = "name: follower", **metadata: Any) -> None:
+def refused(folder: Path, why: str, options: str = "name: arm_2", **metadata: Any) -> None:
     """Connect to an owner with this metadata, in vain."""
     rig = Rig(folder, options)
-    with Owner("follower", **metadata):
+    with Owner("arm_2", **metadata):
         with pytest.raises(NodeError, match=why):
             rig.driver.connect()
         rig.driver.close()
@@ -94,7 +94,7 @@ def test_a_command_comes_back_as_the_state_it_asks_for(rig: Rig, owner: Owner) -
 
 def test_joints_are_found_by_name_whatever_their_order(tmp_path: Path) -> None:
     turned = tuple(reversed(SO101))
-    with Owner("follower", joint_names=turned) as owner:
+    with Owner("arm_2", joint_names=turned) as owner:
         owner.at = owner.at[::-1].copy()
         rig = Rig(tmp_path)
         rig.driver.connect()
@@ -108,10 +108,10 @@ def test_joints_are_found_by_name_whatever_their_order(tmp_path: Path) -> None:
 
 def test_degrees_have_a_zero_and_a_direction(tmp_path: Path) -> None:
     options = (
-        "name: follower, units: degrees, zero: [10, 0, 0, 0, 0], reversed: [elbow_flex], "
+        "name: arm_2, units: degrees, zero: [10, 0, 0, 0, 0], reversed: [elbow_flex], "
         "gripper_shut: 0.04, gripper_open: 0.0"
     )
-    with Owner("follower", robot_class="lab.Arm") as owner:
+    with Owner("arm_2", robot_class="lab.Arm") as owner:
         owner.at = np.array([20.0, -20.0, 20.0, 10.0, 0.0, 0.01])
         rig = Rig(tmp_path, options)
         rig.driver.connect()
@@ -166,7 +166,7 @@ def test_metadata_that_does_not_fit_ends_the_node_by_name(
 
 
 def test_a_unit_is_never_assumed(tmp_path: Path) -> None:
-    refused(tmp_path, "units is degrees, but .*SO101 has norm", "name: follower, units: degrees")
+    refused(tmp_path, "units is degrees, but .*SO101 has norm", "name: arm_2, units: degrees")
     refused(
         tmp_path,
         "set physicalai.gripper_shut and physicalai.gripper_open",
@@ -175,12 +175,12 @@ def test_a_unit_is_never_assumed(tmp_path: Path) -> None:
 
 
 def test_a_zero_of_joints_that_have_their_own_ends_the_node(tmp_path: Path) -> None:
-    refused(tmp_path, "zero is given, but normalised", "name: follower, zero: [1, 0, 0, 0, 0]")
+    refused(tmp_path, "zero is given, but normalised", "name: arm_2, zero: [1, 0, 0, 0, 0]")
 
 
 def test_without_an_owner_the_node_ends_with_what_to_start(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
-    with pytest.raises(NodeError, match=f"no owner of 'follower' at .*:{PORT_OF_FOLLOWER}: start"):
+    with pytest.raises(NodeError, match=f"no owner of 'arm_2' at .*:{PORT_OF_ARM_2}: start"):
         rig.driver.connect()
     rig.driver.close()
 
@@ -210,7 +210,7 @@ def test_a_wrong_state_is_rejected_by_name(
 
 def test_wrong_states_alone_end_the_node_with_what_is_wrong(rig: Rig, owner: Owner) -> None:
     owner.said = {"joint_positions": packed([0.0] * 5)}
-    with pytest.raises(NodeError, match=r"no valid state of 'follower' for 1 s: state: .*\[5\]"):
+    with pytest.raises(NodeError, match=r"no valid state of 'arm_2' for 1 s: state: .*\[5\]"):
         rig.until(lambda: False)
 
 
@@ -225,7 +225,7 @@ def test_one_wrong_state_is_counted_and_forgotten(rig: Rig, owner: Owner) -> Non
 def test_an_owner_that_is_gone_ends_the_node(rig: Rig, owner: Owner) -> None:
     rig.measured()
     owner.close()
-    with pytest.raises(NodeError, match="no valid state of 'follower' for 1 s: is its owner runni"):
+    with pytest.raises(NodeError, match="no valid state of 'arm_2' for 1 s: is its owner runni"):
         rig.until(lambda: False)
 
 
@@ -235,14 +235,19 @@ def test_a_second_commander_is_a_fault_until_it_is_silent(rig: Rig, owner: Owner
     rig.until(lambda: bool(owner.actions))
     assert not rig.driver.fault, "an action of our own is none of somebody else"
     rig.until(lambda: not rig.driver.idle)
-    client = Client("follower", PORT_OF_FOLLOWER)
+    client = Client("arm_2", PORT_OF_ARM_2)
     rig.until(lambda: client.states.try_recv() is not None)
     client.act(owner.at)
     rig.until(lambda: rig.driver.fault != "")
-    assert "somebody else puts actions on physicalai/robot/follower/action" in rig.driver.fault
+    assert "somebody else puts actions on physicalai/robot/arm_2/action" in rig.driver.fault
     assert rig.driver.idle, "the owner holds what another one commanded"
     rig.until(lambda: rig.driver.fault == "")
     client.session.close()
+
+
+@pytest.mark.parametrize(("name", "port"), [("follower", 56572), ("arm", 38977)])
+def test_a_robot_is_looked_for_where_physicalai_itself_puts_it(name: str, port: int) -> None:
+    assert wire.local_endpoint(name) == f"tcp/127.0.0.1:{port}"
 
 
 def test_options_that_do_not_fit_together_are_wrong_by_name(tmp_path: Path) -> None:
