@@ -44,10 +44,11 @@ demo: $(if $(wildcard $(READY)),$(READY),$(DEMO_READY)) ## Simulator, model and 
 	$(BIN)/vla-zenoh demo $(ARGS)
 
 # Tests in real time mostly wait. Those that compute run beside them and give way to them, so that both are over in the time
-# of one; each shows what it has to say when it is over. In real time run three files at once, of which one, with four cores
-# two, are of whole robots (conftest.py); of the rest as many as there are cores, in order of the folders: the long files of
-# tests/sim are not the last ones. A process of theirs that dies ends the run: whoever is to take its place waits for its
-# files for ever. 5 is pytest's word for "none of these".
+# of one; each shows what it has to say when it is over. In real time run two files at once, with four cores three, of which
+# one, with four cores two, are of whole robots (conftest.py); of the rest as many as there are cores, in order of the
+# folders: the long files of tests/sim are not the last ones. A process of theirs that dies ends the run: whoever is to take
+# its place waits for its files for ever. 5 is pytest's word for "none of these".
+ROWS := $(if $(filter 1 2 3,$(shell getconf _NPROCESSORS_ONLN)),2,3)
 FILES := --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
 REALTIME := -o cache_dir=.pytest_cache/realtime -m "$(SUITE) and $(WHICH) and realtime" $(ARGS)
 AT_THE_END_OF_EACH := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
@@ -60,7 +61,7 @@ test-computed: $(READY)
 	nice -n 10 $(BIN)/python -m pytest -n auto $(FILES) -m "$(SUITE) and $(WHICH) and not realtime" $(ARGS) || [ $$? = 5 ]
 
 test-realtime: $(READY)
-	$(BIN)/python -m pytest -n 3 $(FILES) $(AGAIN) $(REALTIME) || [ $$? = 5 ] || \
+	$(BIN)/python -m pytest -n $(ROWS) $(FILES) $(AGAIN) $(REALTIME) || [ $$? = 5 ] || \
 		$(BIN)/python -m pytest $(AT_THE_END) $(REALTIME)
 
 test-long: $(READY) ## Run those that take longer, too, and the files of many whole robots
