@@ -119,6 +119,27 @@ def test_an_axis_outside_its_range_comes_in_within_its_share_of_the_limits(sign:
     assert motion.state.position[0] == pytest.approx(0.0)
 
 
+def test_an_axis_is_not_at_rest_from_when_it_is_told_a_target_until_it_is_there() -> None:
+    motion = axes(1)
+    assert motion.at_rest
+    motion.move_to(np.array([FAR_M]))
+    assert not motion.at_rest
+    while not motion.at_rest:
+        motion.advance(1.0)
+    assert motion.state.position[0] == pytest.approx(FAR_M, abs=ROUNDING_M)
+
+
+@pytest.mark.parametrize("all_to_stop", [True, False])
+def test_a_motion_tells_whether_its_shares_suffice_to_stop_at_its_target(all_to_stop: bool) -> None:
+    for target_m, enough in ((0.3, True), (0.1, False)):
+        motion = axes(1)
+        assert motion.move_to(np.array([1.0]))
+        for _ in range(100):
+            motion.advance(1.0)
+        target = motion.state.position + target_m
+        assert motion.move_to(target, Shares(1.0, 0.5, 0.5), all_to_stop=all_to_stop) == enough
+
+
 def test_halfway_to_rest_is_ahead_of_a_stop_that_is_nearly_over() -> None:
     motion = axes(1)
     motion.move_to(np.array([1.0]))

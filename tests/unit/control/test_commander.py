@@ -25,7 +25,7 @@ from command_rig import (
 )
 
 from vla_zenoh.control.axis_smoothing import AxisSmoother
-from vla_zenoh.control.commander import MAX_ANSWER_S, Commander, Inputs, Setting
+from vla_zenoh.control.commander import ANSWER_S, MAX_ANSWER_S, Commander, Inputs, Setting
 from vla_zenoh.control.limits import BEGIN_JOINT
 from vla_zenoh.control.motion_pipeline import LINGER_NS
 from vla_zenoh.keys import OPENING
@@ -1375,6 +1375,13 @@ def test_the_gripper_of_a_part_that_is_not_there_holds_nothing() -> None:
     assert "no part 'left'" in rig.events[-1].why
 
 
+def test_what_the_gripper_holds_already_is_no_news() -> None:
+    rig = Rig(reach=reach_of(profile()))
+    for _ in range(2):
+        rig.tick(Setting("held", BOX))
+    assert [event.what for event in rig.events].count("gripper_holds") == 1
+
+
 def test_a_router_whose_clock_was_set_back_does_not_keep_an_arm_stopped() -> None:
     rig = Rig()
     rig.tick(Setting("stop", put_ns=2_000_000_000))
@@ -1511,10 +1518,10 @@ def test_a_tick_without_a_trajectory_brakes_and_the_next_one_goes_on(
 UNKNOWN = {WORKER: "knows no prompt 'dance'"}
 
 
-def asked_rig() -> Rig:
+def asked_rig(rate_hz: float = 5.0) -> Rig:
     """A worker that complains about the prompt before; then a new one and an activation at once."""
     rig = Rig()
-    rig.tick(chunks=[rig.chunk([STAND])])
+    rig.tick(Setting("rate", rate_hz), chunks=[rig.chunk([STAND])])
     rig.peers = replace(rig.peers, worker_complaints=UNKNOWN)
     rig.tick()
     rig.tick(Setting("prompt", "HARD: go down"), Setting("active", True))
@@ -1532,9 +1539,16 @@ def test_an_activation_waits_until_the_worker_has_heard_the_prompt_before_it() -
     assert rig.refused == {}
 
 
-def test_a_worker_that_cannot_do_the_new_prompt_either_is_waited_for_a_bounded_time() -> None:
-    rig = asked_rig()
-    rig.run(MAX_ANSWER_S)
+@pytest.mark.parametrize(
+    ("rate_hz", "patience_s"), [(0.2, MAX_ANSWER_S), (5.0, ANSWER_S + 0.2), (50.0, ANSWER_S + 0.02)]
+)
+def test_a_worker_that_cannot_do_the_new_prompt_either_is_waited_for_a_bounded_time(
+    rate_hz: float, patience_s: float
+) -> None:
+    rig = asked_rig(rate_hz)
+    rig.run(patience_s - 0.02)
+    assert rig.refused == {}
+    rig.run(0.04)
     assert rig.refused["activate_refused"] == 1
     assert "knows no prompt 'dance'" in rig.commander.why
     rig.peers = replace(rig.peers, worker_complaints={})

@@ -253,6 +253,14 @@ def test_what_five_joints_cannot_do_is_rejected_by_name(action: dict[str, Any], 
     assert why in arm.rig.commander.why
 
 
+def test_a_turn_that_five_joints_cannot_make_is_a_reason_against_an_activation() -> None:
+    arm = Joints(so101(), space="tcp", joints=(), kind="delta", rotation="rotvec")
+    arm.send([0.0, 0.0, 0.0, 0.0, 0.0, 0.1])
+    arm.tick(Setting("active", True))
+    assert arm.rig.state == "inactive"
+    assert "that the 5 joints of robot 'so101' cannot make from here: yaw" in arm.rig.commander.why
+
+
 @pytest.mark.parametrize("mode", ["replace", "ensemble"])
 def test_the_goal_stays_inside_the_box_when_the_leash_cuts_it_or_plans_are_averaged(
     mode: str,

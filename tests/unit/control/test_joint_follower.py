@@ -314,6 +314,19 @@ def test_a_goal_beyond_the_leash_is_followed_as_one_on_it_and_told() -> None:
     assert told == [set(), {"lead_m", "lead_rad"}]
 
 
+def test_joints_too_slow_for_a_pose_slow_down_together_and_keep_its_direction() -> None:
+    follower = JointFollower(KINEMATICS, HOME_RAD, acceleration_rad_s2=200.0)
+    motion, aside = JointMotion.standing(HOME_RAD), np.array([0.0, 5.0, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(10):
+        here = KINEMATICS.forward(motion.position_rad)
+        motion, hits = follower.step(motion, here, aside, TICK_S)
+        assert {hit.name for hit in hits} == {"joint_velocity"}
+    fastest = float((np.abs(motion.velocity_rad_s) / follower.velocity_rad_s).max())
+    assert fastest == pytest.approx(1.0, rel=RTOL)
+    twist = KINEMATICS.jacobian(motion.position_rad) @ motion.velocity_rad_s
+    assert np.linalg.norm(twist - aside * twist[1] / aside[1]) < 0.1 * twist[1]
+
+
 def test_an_arm_that_begins_outside_of_the_box_is_led_in() -> None:
     arm = Arm(profile())
     inside = KINEMATICS.forward(HOME_RAD)

@@ -519,3 +519,13 @@ def test_it_does_not_return_to_where_a_person_has_pushed_the_arm_away_from_since
         if target is not None:
             places_m.append(float(target.position_m[0] - START_M[0]))
     assert places_m[0] == max(places_m) == pytest.approx(0.03)
+
+
+def test_one_that_begins_anew_sets_out_from_where_the_arm_is_by_then() -> None:
+    limits = profile().limits
+    retreat, commanded = Retreat(limits, Contact(limits.contact)), Pose(START_M, np.eye(3))
+    for x_m in (0.01, 0.02):
+        measured = Pose(START_M - [x_m, 0.0, 0.0], np.eye(3))
+        retreat.measure(measured)
+        retreat.begin(commanded)
+        assert retreat.step(commanded, 0, at_rest=True)[0] is measured

@@ -221,6 +221,10 @@ REFUSED: dict[str, Refused] = {
         ("m long from its first joint to the TCP", "divided by 1000"),
     ),
     "millimetres": Refused(urdf([*MILLIMETRES, TOOL]), ("200 m", "millimetres")),
+    "a first link in millimetres": Refused(
+        urdf([*arm(SIX, j2=Row("j2", axis=Y, at_m=(0.0, 0.0, 200.0))), TOOL]),
+        ("'j2' 200 m from the joint before it", "millimetres"),
+    ),
     "a mesh in millimetres": Refused(
         WHOLE.replace(
             f'<link name="j3_link"><collision><geometry>{BALL}',
