@@ -288,3 +288,12 @@ def test_an_animated_png_is_its_still_image() -> None:
     frame = (b"fcTL", struct.pack(">IIIIIHHBB", 0, 4, 2, 0, 0, 1, 1, 0, 0))
     with pytest.raises(CodecError, match="decoded"):
         decode_png16(png_of(head, animation, frame, (b"IDAT", b""), (b"IEND", b"")))
+
+
+NO_PNGS = {"a jpeg": JPEG, "cut off": PNG_BEGINS + bytes(15), "another": b"PNG" + bytes(99)}
+
+
+@pytest.mark.parametrize("payload", NO_PNGS.values(), ids=NO_PNGS)
+def test_what_does_not_begin_as_a_png_is_none(payload: bytes) -> None:
+    with pytest.raises(CodecError, match=r"not a PNG file$"):
+        decode_png(payload)

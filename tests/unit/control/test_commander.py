@@ -63,6 +63,8 @@ def test_before_activation_nothing_is_streamed_and_chunks_are_only_looked_at() -
         assert rig.send([UP]).pose is None
     assert rig.state == "inactive"
     assert rig.refused == {}
+    tracking = rig.commander.parts[0].tracking
+    assert (tracking.apart_m, tracking.apart_rad) == (0.0, 0.0), "there is no command to follow"
 
 
 def test_activation_is_refused_with_every_reason_as_an_event() -> None:

@@ -13,7 +13,7 @@ from other_arms import so101
 from panda_arm import ARM_JOINTS, HOME_RAD, swivelled
 
 from vla_zenoh.control.commander import Setting
-from vla_zenoh.control.limits import workspace_corners
+from vla_zenoh.control.limits import BEGIN_JOINT, workspace_corners
 from vla_zenoh.types import FloatArray, JointState, Stamped
 
 EXACT_RAD = 1e-6
@@ -318,6 +318,36 @@ def test_a_joint_worker_that_takes_over_from_poses_moves_as_far_as_it_asks(
     arm.send(*(0.06 * count * swivel for count in counts))
     arm.run(2.5)
     np.testing.assert_allclose(arm.joints_rad, start_rad + 0.96 * swivel, atol=1e-4)
+
+
+def test_joints_that_brake_go_on_without_a_step_where_their_controller_lags_at_an_activation() -> (
+    None
+):
+    arm = Joints(panda(), space="tcp", joints=(), kind="delta", rotation="rotvec")
+    told, held = arm.rig.joint_state, list[FloatArray]()
+
+    def late() -> Stamped[JointState]:
+        state = told()
+        held.append(state.record.position_rad)
+        record = replace(state.record, reference_rad=held[max(len(held) - 3, 0)])
+        return replace(state, record=record)
+
+    def activate() -> None:
+        arm.send([0.0] * 6)
+        arm.tick(Setting("active", True))
+        assert arm.rig.state == "active", arm.rig.commander.why
+
+    arm.rig.joint_state = late
+    activate()
+    for _ in range(6):
+        arm.send([0.0, 0.03, 0.0, 0.0, 0.0, 0.0])
+        arm.run(0.09)
+    arm.tick(Setting("active", False))
+    arm.run(0.04)
+    assert np.abs(held[-1] - held[-3]).max() > 2 * BEGIN_JOINT.turns
+    activate()
+    arm.run(0.5)
+    arm.assert_within_limits()
 
 
 @pytest.mark.parametrize("command", ["joint", "pose"])

@@ -314,6 +314,18 @@ def test_a_goal_beyond_the_leash_is_followed_as_one_on_it_and_told() -> None:
     assert told == [set(), {"lead_m", "lead_rad"}]
 
 
+@pytest.mark.parametrize("way_m", [[0.0, 0.1, 0.0], [0.0, 0.0, -0.1]])
+def test_a_pose_is_no_faster_than_slow_joints_can_follow(way_m: list[float]) -> None:
+    slow_rad_s, fastest_rad_s = 0.3, 0.0
+    arm = Arm(profile(velocity_rad_s=slow_rad_s))
+    arm.step(np.array(way_m), np.zeros(3), 0)
+    for _ in range(150):
+        arm.tick()
+        assert arm.stage.time_rate == 1.0, "it does not wait for them"
+        fastest_rad_s = max(fastest_rad_s, float(np.abs(arm.rate_rad_s).max()))
+    assert fastest_rad_s > 0.7 * slow_rad_s
+
+
 def test_joints_too_slow_for_a_pose_slow_down_together_and_keep_its_direction() -> None:
     follower = JointFollower(KINEMATICS, HOME_RAD, acceleration_rad_s2=200.0)
     motion, aside = JointMotion.standing(HOME_RAD), np.array([0.0, 5.0, 0.0, 0.0, 0.0, 0.0])

@@ -8,13 +8,16 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from command_rig import Rig
 
+from vla_zenoh.control.commander import Commander
 from vla_zenoh.control.joint_space import JointBounds, JointPath
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.part_spacing import PartSpacing
-from vla_zenoh.control.plan_timeline import joint_goal
+from vla_zenoh.control.part_spacing import NAME, PartSpacing
+from vla_zenoh.control.plan_timeline import Goal, joint_goal
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.watchdog import PERIOD_NS
+from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import FloatArray
 
@@ -128,6 +131,37 @@ def test_arms_near_each_other_are_slow_while_they_come_nearer_and_not_as_they_pa
 def test_arms_that_begin_too_near_to_each_other_may_move_apart_and_no_nearer() -> None:
     assert not Arms().stand(1.57, ahead=1.56)[1]
     assert Arms().stand(1.57, ahead=1.58)[1]
+
+
+def test_arms_that_stand_before_each_other_say_so_once_each_time() -> None:
+    rig, seen = Rig(), list[LimitHit]()
+    near = LimitHit(NAME, 0.02, 0.03, where="left hand and right hand")
+    rig.commander.spacing = cast(
+        "Any",
+        SimpleNamespace(
+            monitor=lambda _: None, look=lambda *_, moves: (None, seen[0] if seen else None)
+        ),
+    )
+    rig.activate()
+    for _ in range(2):
+        seen[:] = [near]
+        rig.run(0.1)
+        seen.clear()
+        rig.run(0.1)
+    told = [event.why for event in rig.events if event.what == NAME]
+    assert told == ["stand at left hand and right hand"] * 2
+
+
+def test_a_robot_is_at_rest_when_all_its_arms_are() -> None:
+    commander = Commander(pair(), reach=dict.fromkeys(pair().part_names, reach()))
+    assert commander.at_rest
+    for part in commander.parts:
+        path = part.motion._poses
+        stands = path.motion.pose
+        path.go_to(Goal(Pose(stands.position_m + 0.05, stands.rotation), 0.08))
+        assert not commander.at_rest
+        path.reset(stands)
+        assert commander.at_rest
 
 
 @pytest.mark.parametrize("acceleration_rad_s2", [1.0, 2.25])

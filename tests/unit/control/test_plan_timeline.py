@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from panda_arm import HOME_RAD, panda
 
 from vla_zenoh.control.limits import into_workspace
-from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3
 from vla_zenoh.policy.plan_clock import HISTORY_NS
 from vla_zenoh.profile import Limits
@@ -56,6 +57,11 @@ def test_a_plan_has_asked_for_the_time_it_had_and_for_one_step_at_least(
 ) -> None:
     plan = Plan(0, 0, DT_NS, rising(at(0.3), 3))
     assert height(plan.goal_at(int(t_ms * MS))) == pytest.approx(0.3 + steps * STEP_M)
+
+
+def test_between_two_waypoints_of_joints_the_width_goes_along() -> None:
+    wide, narrow = (joint_goal(panda(), HOME_RAD, width_m) for width_m in (0.08, 0.04))
+    assert wide.between(narrow, 0.25).width_m == pytest.approx(0.07)
 
 
 def test_between_two_waypoints_rotation_and_width_go_along() -> None:

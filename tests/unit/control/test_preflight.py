@@ -11,7 +11,7 @@ import pytest
 from command_rig import MS, OFTEN, START_NS, WORKER, Rig, model_spec, profile
 
 from vla_zenoh.control.limits import BEGIN_M
-from vla_zenoh.control.policy_check import wrong_rate
+from vla_zenoh.control.policy_check import spec_errors, wrong_rate
 from vla_zenoh.control.preflight import (
     SETTLED,
     SETTLED_NS,
@@ -335,6 +335,19 @@ def test_a_picture_of_a_size_the_spec_cannot_take_is_a_reason() -> None:
     ready.peers = replace(ready.peers, specs={WORKER: spec})
     (reason,) = ready.reasons()
     assert re.search(r"picture_size: camera 'front' sends \d+x\d+, the spec asks for 64x48", reason)
+
+
+@pytest.mark.parametrize(("rate_hz", "enough"), [(2.0, True), (1.9, False)])
+def test_a_camera_may_be_as_slow_as_the_spec_allows_and_no_slower(
+    rate_hz: float, enough: bool
+) -> None:
+    ready = Ready()
+    spec = ready.peers.specs[WORKER]
+    looks = spec.observation.model_copy(update={"max_age_s": 0.5})
+    cameras = {"front": {"rate_hz": rate_hz}}
+    slow = override(ready.profile, {"cameras": cameras})
+    found = spec_errors(slow, spec.model_copy(update={"observation": looks}))
+    assert [error.name for error in found] == [] if enough else ["camera_rate"]
 
 
 def test_a_worker_that_needs_no_prompt_and_no_camera_gets_neither() -> None:

@@ -428,6 +428,11 @@ def test_joints_slow_no_step_that_takes_the_tcp_longer() -> None:
     assert step.slowdown is None
 
 
+def test_the_first_look_of_a_model_that_was_moved_counts_as_one() -> None:
+    SHADOW.cost = 5
+    assert at(HOME_RAD).cost == 1
+
+
 def test_the_same_questions_get_the_same_answers() -> None:
     first = walk(at(HOME_RAD), STEP_M * (UP + 0.3 * LEFT), 0.02 * ROLL, 40)
     joints = SHADOW.joints_rad

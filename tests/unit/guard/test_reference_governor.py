@@ -237,3 +237,15 @@ def test_the_acceleration_of_a_command_goes_on_for_a_while_if_the_next_is_lost()
     later = Extrapolation(JointSpace(), told, None, 0.0, brake).at(ACCELERATE_S)
     assert later.velocity_rad_s[0] == pytest.approx(0.1 + ACCELERATE_S)
     assert later.position_rad[0] == pytest.approx(0.1 * ACCELERATE_S + ACCELERATE_S**2 / 2)
+
+
+def test_a_turn_about_three_axes_ends_within_the_jerk_of_one_if_the_next_command_is_lost() -> None:
+    axes, turn = np.ones(6), np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) / math.sqrt(3)
+    brake = GovernorLimits(*(BRAKE_MARGIN * limit * axes for limit in OWN), axes, axes)
+    here = Pose(np.zeros(3), np.eye(3))
+    told = Motion(here, 0.01 * turn, OWN[1] * turn)
+    path = Extrapolation(PoseSpace(), told, None, 0.0, brake)
+    changes = [path.at(DT_S * tick).acceleration for tick in range(300)]
+    jerk = np.linalg.norm(np.diff(changes, axis=0), axis=1) / DT_S
+    assert 0.9 * OWN[2] < jerk.max() < 1.02 * OWN[2]
+    assert np.linalg.norm(changes[-1]) < 0.05 * OWN[1]

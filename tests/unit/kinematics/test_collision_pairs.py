@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from described_arms import SEVEN, TOOL, Row, Y, arm, urdf
 
-from vla_zenoh.kinematics.collision import HELD, CollisionModel
+from vla_zenoh.kinematics.collision import HELD, TABLE, CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import KeepOut
 from vla_zenoh.types import HeldBox
@@ -46,6 +46,19 @@ def test_the_hand_is_what_moves_with_the_tcp_whichever_joint_comes_last(tmp_path
     collisions = CollisionModel(Kinematics(path, "tcp", JOINTS), near_m=1.0, table_z_m=-0.05)
     hand = {pair.first for pair in collisions.pairs if pair.is_hand}
     assert hand == {"j7_link", "tcp", HELD}
+
+
+@pytest.mark.parametrize(("slides_m", "checked"), [(0.0015, True), (0.0005, False)])
+def test_a_distance_that_a_joint_changes_by_more_than_a_millimetre_is_checked(
+    tmp_path: Path, slides_m: float, checked: bool
+) -> None:
+    lift = Row("lift", kind="prismatic", ends=(0.0, slides_m))
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf([lift, *arm(SEVEN), TOOL]))
+    kinematics = Kinematics(path, "tcp", ("lift", *JOINTS))
+    table_z_m = lift.at_m[2] - 0.05
+    pairs = CollisionModel(kinematics, near_m=NEAR_M, table_z_m=table_z_m).pairs
+    assert (("lift_link", TABLE) in [pair[:2] for pair in pairs]) == checked
 
 
 CORNERS = ((0, 0, 0), (100, 0, 0), (0, 20, 0), (0, 0, 20))
