@@ -162,3 +162,16 @@ def test_axes_stay_in_their_range_whatever_they_are_told_on_their_way() -> None:
             for _ in range(rng.randint(1, int(60 / speed))):
                 motion.advance(1.0)
                 assert np.abs(motion.state.position).max() <= RANGE_M + ROUNDING_M
+
+
+def test_a_motion_about_to_start_does_not_rest_and_one_stopped_before_its_target_does() -> None:
+    motion = axes(1)
+    motion.move_to(np.array([1.0]))
+    assert not motion.at_rest
+    for _ in range(100):
+        motion.advance(1.0)
+    motion.brake()
+    assert not motion.at_rest
+    while motion.advance(1.0):
+        pass
+    assert motion.at_rest

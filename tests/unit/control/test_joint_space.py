@@ -372,3 +372,20 @@ def test_an_approach_in_joints_takes_no_more_than_a_step_at_a_time() -> None:
     assert timeline is not None
     turned_rad = np.diff([goal.joints_rad[6] for goal in timeline.plan.goals])
     assert turned_rad.max() == pytest.approx(arm.profile.limits.step_rad)
+
+
+def test_the_share_of_a_long_way_keeps_the_tcp_within_its_speed_along_each_axis_all_the_way() -> (
+    None
+):
+    slow = {"velocity_m_s": 0.05, "acceleration_m_s2": 0.3, "jerk_m_s3": 1.0}
+    profile = panda(limits={"translation": slow})
+    reach = ReachabilityFilter(profile)
+    path = JointPath(profile, JointBounds(profile, reach.kinematics, reach.barriers))
+    path.stand(HOME_RAD)
+    way_rad = 1.2 * np.eye(7)[0]  # at first sideways, at the end mostly back
+    share = path.shares(joint_goal(path.kinematics, HOME_RAD + way_rad, 0.04)).velocity
+    rates_rad_s = share * path.box[0, 0] * np.eye(7)[0]
+    places = [HOME_RAD + part * way_rad for part in np.linspace(0.0, 1.0, 13)]
+    twists = np.array([path.kinematics.jacobian(place) @ rates_rad_s for place in places])
+    fastest_m_s = np.abs(twists[:, :3]).max()
+    assert 0.9 * slow["velocity_m_s"] < fastest_m_s <= slow["velocity_m_s"]

@@ -248,3 +248,13 @@ def test_a_joint_is_bounded_in_its_own_unit(what: str, joint: int) -> None:
     way = np.eye(4)[joint] * most
     assert admits(0.9 * way)
     assert not admits(1.1 * way)
+
+
+def test_of_joints_that_turn_and_slide_the_one_furthest_beyond_its_own_bound_has_not_settled() -> (
+    None
+):
+    most = BEGIN_JOINT.of(arm().slides)
+    way = ZERO.copy()
+    way[SLIDES], way[TURNS] = 1.5 * most[SLIDES], 0.9 * most[TURNS]
+    assert way[TURNS] > way[SLIDES]
+    assert not has_settled(way)

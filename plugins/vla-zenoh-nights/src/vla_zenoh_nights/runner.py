@@ -59,14 +59,15 @@ class Webhook:
 
     def _send(self) -> None:
         while (message := self._waiting.get()) is not None:
-            for attempt in range(ATTEMPTS):
+            for left in reversed(range(ATTEMPTS)):
                 try:
                     post_json(self._url, message, PATIENCE_S)
                     break
                 except (OSError, ValueError) as error:
-                    if attempt == ATTEMPTS - 1:
+                    if left:
+                        time.sleep(BACK_OFF_S)
+                    else:
                         self._warn(f"webhook: {message['what']!r} was not delivered: {error}")
-                    time.sleep(BACK_OFF_S)
 
 
 RETRY_S, MAX_TROUBLE = 5.0, 20
