@@ -133,6 +133,21 @@ def test_commands_that_curve_along_a_face_do_not_creep_through_it() -> None:
     assert hits > 0
 
 
+def test_a_slow_arm_does_not_creep_along_an_arc_through_a_face() -> None:
+    """Each tick takes it out of the box by less than is seen."""
+    turned, aside_rad, share = np.eye(7)[0], 0.1, 0.01
+    face_m = float(made_path().motion.pose.position_m[0] * np.cos(aside_rad))
+    profile = panda(limits={"workspace": {"x_m": [0.2, face_m]}})
+    reach = ReachabilityFilter(profile)
+    path = JointPath(profile, JointBounds(profile, reach.kinematics, reach.barriers))
+    path.stand(HOME_RAD - aside_rad * turned)
+    # All places that are looked at on the whole way are inside.
+    goal = joint_goal(path.kinematics, HOME_RAD + 0.7 * turned, 0.0)
+    path.go_to(goal, Shares(share, share**2, share**3))
+    furthest_m = max(path.tick().pose.position_m[0] for _ in range(300)) - face_m
+    assert 0.0 < furthest_m < 0.1 * OUTSIDE_M
+
+
 def test_a_stop_passes_no_joint_s_targets() -> None:
     """Joints that do not move in proportion stop one by one; none waits for another. Others stop on
     their line, where one has the least acceleration and another the least jerk."""
