@@ -119,16 +119,6 @@ def test_an_axis_outside_its_range_comes_in_within_its_share_of_the_limits(sign:
     assert motion.state.position[0] == pytest.approx(0.0)
 
 
-def test_an_axis_is_not_at_rest_from_when_it_is_told_a_target_until_it_is_there() -> None:
-    motion = axes(1)
-    assert motion.at_rest
-    motion.move_to(np.array([FAR_M]))
-    assert not motion.at_rest
-    while not motion.at_rest:
-        motion.advance(1.0)
-    assert motion.state.position[0] == pytest.approx(FAR_M, abs=ROUNDING_M)
-
-
 @pytest.mark.parametrize("all_to_stop", [True, False])
 def test_a_motion_tells_whether_its_shares_suffice_to_stop_at_its_target(all_to_stop: bool) -> None:
     for target_m, enough in ((0.3, True), (0.1, False)):

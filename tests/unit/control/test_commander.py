@@ -1377,6 +1377,13 @@ def test_the_gripper_of_a_part_that_is_not_there_holds_nothing() -> None:
     assert "no part 'left'" in rig.events[-1].why
 
 
+def test_an_arm_without_a_gripper_holds_nothing() -> None:
+    bare = override(profile(), {"robot": {"gripper": None, "finger_joints": []}})
+    rig = Rig(bare, reach=reach_of(bare), gripper="none")
+    rig.tick(Setting("held", BOX))
+    assert "it holds nothing" in rig.events[-1].why
+
+
 def test_what_the_gripper_holds_already_is_no_news() -> None:
     rig = Rig(reach=reach_of(profile()))
     for _ in range(2):
