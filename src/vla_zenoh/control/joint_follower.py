@@ -216,7 +216,7 @@ class JointFollower:
             reached = self._reachable(wanted, now, dt_s)
             excess = np.where(held, 0.0, np.maximum(reached - high, low - reached))
             joint = int(np.argmax(excess))
-            if excess[joint] <= ROUNDING_RAD_S or held.sum() >= len(joints) - 1:
+            if excess[joint] <= ROUNDING_RAD_S:
                 break
             held[joint] = True
             onto[joint] = min(max(reached[joint], low[joint]), high[joint])

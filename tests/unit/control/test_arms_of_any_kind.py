@@ -10,8 +10,12 @@ from joint_rig import Joints
 from made_arm import SLIDE_M, made_arm
 
 from vla_zenoh.control.commander import Setting
+from vla_zenoh.control.joint_follower import JointFollower, JointMotion
+from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.plan_timeline import joint_goal
 from vla_zenoh.errors import ProfileError
+from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.so3 import Pose, exp3
 from vla_zenoh.profile import override
 
 EXACT = 1e-6
@@ -138,3 +142,20 @@ def test_no_joint_is_faster_than_its_description_says_whatever_the_profile_allow
 def test_an_arm_has_sixteen_joints_at_most(tmp_path: Path) -> None:
     with pytest.raises(ProfileError, match="arm_joints"):
         made_arm(tmp_path, "ty" * 17)
+
+
+@pytest.mark.parametrize("chain", ["sx", "sxty", MIXED])
+def test_of_a_pose_beyond_the_ends_of_all_its_joints_an_arm_names_each_and_stands_there(
+    tmp_path: Path, chain: str
+) -> None:
+    kinematics = make_kinematics(made_arm(tmp_path, chain))
+    follower = JointFollower(kinematics, np.zeros(kinematics.size))
+    end = follower.upper_rad
+    here, jacobian = kinematics.pose_and_jacobian(end)
+    beyond = jacobian @ np.where(kinematics.slides, 0.02, 0.1)
+    target = Pose(here.position_m + beyond[:3], exp3(beyond[3:]) @ here.rotation)
+    motion, hits = JointMotion.standing(end), list[LimitHit]()
+    for _ in range(50):
+        motion, hits = follower.step(motion, target, np.zeros(6), 0.004)
+    assert motion.position_rad == pytest.approx(end, abs=EXACT)
+    assert {hit.where for hit in hits if hit.name == "joint_limit"} == {*kinematics.arm_joints}
