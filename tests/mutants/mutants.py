@@ -34,6 +34,7 @@ from mutations import Mutant, draw
 ROOT = Path(__file__).resolve().parents[2]
 MUTATED = [f"src/vla_zenoh/{folder}" for folder in ("control", "guard", "codec", "kinematics")]
 TESTS = [f"tests/unit/{folder}" for folder in ("control", "guard", "codec", "kinematics")]
+TESTS.append("tests/unit/ros2/test_ros2_messages.py")  # of codec/cdr.py
 EQUIVALENT = Path(__file__).with_name("equivalent.txt")
 FIRST_TESTS = 15
 """One of each test function; the rest runs only if these pass."""
