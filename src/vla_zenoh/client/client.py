@@ -265,6 +265,8 @@ class StopClient(NodeRegistry):
         self._subscriptions: list[Any] = []
         self._stop_s = 0.0
         self._standstill: list[Standstill] = []
+        self._unread: dict[type[Any], str] = {}
+        """Kind of record -> why the newest one of it cannot be read."""
         self.other_version = ""
         """Which side is to be updated, where nodes write another version of the wire."""
 
@@ -288,11 +290,14 @@ class StopClient(NodeRegistry):
         self, kind: type[Value], sample: zenoh.Sample, limit: int = records.SMALL_BYTES
     ) -> tuple[Header, Value] | None:
         try:
-            return header_of(sample), records.decode(kind, bytes_of(sample.payload, limit))
-        except CodecError as error:
+            found = header_of(sample), records.decode(kind, bytes_of(sample.payload, limit))
+        except CodecError as error:  # the nodes count and report it
+            self._unread[kind] = f"{self.keys.short(str(sample.key_expr))}: {error}"
             if error.reason == "schema":
-                self.other_version = f"{self.keys.short(str(sample.key_expr))}: {error}"
-            return None  # the nodes count and report it
+                self.other_version = self._unread[kind]
+            return None
+        self._unread.pop(kind, None)
+        return found
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         found = self._decode(NodeStatus, sample, MAX_STATUS_BYTES)
@@ -677,15 +682,18 @@ class Client(StopClient):
 
         If neither comes in time, an activation is taken back: it must not take effect later.
         """
-        activates = what == "activate"
-        began_s, key = time.monotonic(), self.keys.active if activates else getattr(self.keys, what)
+        give_up_s = time.monotonic() + timeout_s
+        if not self._reads_task(what, timeout_s):
+            raise self._unanswered(what, timeout_s)
+        activates, began_s = what == "activate", time.monotonic()
+        key = self.keys.active if activates else getattr(self.keys, what)
         self.publish(key, text)
 
         def over() -> bool:
             lost = time.monotonic() > began_s + ANSWER_S and "command" in self.starting()
             return bool(self._refused(what, began_s) or self._taken(taken, began_s)) or lost
 
-        self.wait_for(over, timeout_s)
+        self.wait_for(over, give_up_s - began_s)
         if self._refused(what, began_s):
             time.sleep(0.1)  # the other reasons follow the first
             rejections = self._refused(what, began_s)
@@ -697,17 +705,37 @@ class Client(StopClient):
             return task
         if activates:
             self.publish(key, "false")
+        raise self._unanswered(what, timeout_s)
+
+    def _reads_task(self, what: str, timeout_s: float) -> bool:
+        """Whether a task of this robot could be read, for which it waits.
+
+        Nothing is put before: a robot of another version obeys settings, which are plain text, and
+        nobody here would see it. A stop is put at once.
+
+        Raises:
+            SessionError: there is one that cannot be read.
+        """
+        self.wait_for(lambda: self.task is not None or Task in self._unread, timeout_s)
+        if self.task is None and Task in self._unread:
+            raise SessionError(
+                f"{what}: nothing was put, since what robot {self.keys.robot!r} does cannot be "
+                f"read: {self._unread[Task]}"
+            )
+        return self.task is not None
+
+    def _unanswered(self, what: str, timeout_s: float) -> SessionError:
         if "command" not in self.alive:
             names = ", ".join(self.starting())
             starts = f"; starting: {names}" if names else ""
-            raise SessionError(
+            return SessionError(
                 f"{what}: no command node of robot {self.keys.robot!r} is running{starts}"
             )
         status = self.status("command")
         unread = self.other_version or "it has not reported its state yet"
         state = f"its state is {status.state}" if status else unread
         silent = StartingError if self._cold else SessionError
-        raise silent(
+        return silent(
             f"{what}: the command node of robot {self.keys.robot!r} is alive, but did not accept "
             f"this within {timeout_s:g} s; {state}. It may just have started: try again, or see "
             "`vla-zenoh status`"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -20,13 +20,13 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.drive import _reaches
 from vla_zenoh.client.client import MAX_NODES, MAX_WHY, Client
 from vla_zenoh.client.remote_robot import RemoteRobot
-from vla_zenoh.codec import records
+from vla_zenoh.codec import message, records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES
 from vla_zenoh.errors import SessionError
-from vla_zenoh.keys import Kind
+from vla_zenoh.keys import Kind, last_chunk
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.types import Event, Header, InferenceDebug, JointState, NodeStatus, PoseState
+from vla_zenoh.types import Event, Header, InferenceDebug, JointState, NodeStatus, PoseState, Task
 
 STRANGERS = 2000
 TOKENS = 300
@@ -95,6 +95,60 @@ def test_a_person_with_another_version_is_told_which_side_to_update(
         until("its status has come", lambda: client.other_version)
         with pytest.raises(SessionError, match=f"status/command: schema .* on {who}"):
             client.set_prompt("hold", 0.2)
+        token.undeclare()
+
+
+SETTINGS: dict[str, Callable[[Client], object]] = {
+    "prompt": lambda client: client.set_prompt("go", 2.0),
+    "worker": lambda client: client.set_worker("scripted", 2.0),
+    "rate": lambda client: client.set_rate(4.0, 2.0),
+    "speed": lambda client: client.set_speed(40.0, 2.0),
+    "slower": lambda client: client.slow_down(40.0, 2.0),
+    "active": lambda client: client.activate(2.0),
+    "held": lambda client: client.activate_with_deadman("test", 2.0),
+}
+
+
+@pytest.mark.parametrize("theirs", ["another schema", "another task"])
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_a_robot_whose_task_cannot_be_read_is_told_nothing_but_a_stop(
+    profile: Profile, monkeypatch: pytest.MonkeyPatch, setting: str, theirs: str
+) -> None:
+    """It would obey, and its client would say that it did not."""
+    task = message.unpack(records.encode(Task(1, False, "hold", "scripted", 5.0)))
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        put: list[str] = []
+        heard = there.declare_subscriber(
+            profile.keys.all_keys, lambda sample: put.append(last_chunk(str(sample.key_expr)))
+        )
+        client = Client(profile, here).subscribe()
+        token = there.liveliness().declare_token(profile.keys.alive("command"))
+        until("the node is there", lambda: "command" in client.alive)
+        await_match(here, profile.keys.active)
+        with monkeypatch.context() as patch:
+            if theirs == "another schema":
+                patch.setattr(keys, "SCHEMA", keys.SCHEMA + 1)
+            else:
+                del task["episode"]
+            header = records.encode_header(Header(1, 2, "command#1"))
+        publisher = there.declare_publisher(profile.keys.task)
+        ends = threading.Event()
+
+        def publish() -> None:
+            while not ends.wait(0.05):
+                publisher.put(message.pack(task), attachment=header)
+
+        publishing = threading.Thread(target=publish)
+        publishing.start()
+        why = "schema" if theirs == "another schema" else "Task lacks episode"
+        with pytest.raises(SessionError, match=f"nothing was put, since .*: task: .*{why}"):
+            SETTINGS[setting](client)
+        client.stop()
+        until("a stop is put", lambda: "stop" in put)
+        assert set(put) <= {"stop", "task"}
+        ends.set()
+        publishing.join()
+        heard.undeclare()
         token.undeclare()
 
 
