@@ -86,6 +86,7 @@ def test_a_session_from_prompt_to_reset(chain: Chain, person: Person) -> None:
     person.ok("use", "scripted")
 
     assert "SIM | active: worker scripted, prompt 'HARD: go up', 5 Hz" in person.ok("activate")
+    assert "SIM | was active already: worker scripted" in person.ok("activate")
     chain.until("it moves", chain.moves)
     assert "inactive, the arm stands: robot panda" in person.ok("deactivate")
     assert not chain.moves()

@@ -13,7 +13,9 @@ from camera_rig import free_endpoint, until
 from vla_zenoh_replay.replay import Replay, ReplayResult
 from vla_zenoh_web.recordings import Recordings
 
+from vla_zenoh import keys
 from vla_zenoh.bus.session import alive_nodes, open_session
+from vla_zenoh.codec import records
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.recorder import Recorder
@@ -150,3 +152,22 @@ def test_whatever_ends_the_writing_ends_the_recording_with_its_reason(
     assert "a fault that nobody thought of" in recorded.failure
     assert recorded.seconds < PATIENCE_S
     await_gone(session, profile)
+
+
+def test_samples_of_another_version_of_the_wire_are_counted_with_what_to_update(
+    profile: Profile, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(keys, "SCHEMA", keys.SCHEMA + 1)
+        newer = records.encode_header(Header(1, 2, "sim#1"))
+    recorder = Recorder(profile, session, tmp_path / "run.mcap").start()
+
+    def counted() -> bool:
+        session.put(profile.keys.state_pose, b"", attachment=newer)
+        session.put(profile.keys.prompt, b"go", attachment=b"of somebody else")
+        return recorder.recorded.unreadable > 2
+
+    until("some are counted", counted)
+    recorded = recorder.close()
+    assert recorded.samples[profile.keys.state_pose] == recorded.unreadable
+    assert "update vla-zenoh on this side" in recorded.unreadable_why

@@ -103,9 +103,13 @@ def activate(
 
     with target.operator("activate") as client:
         stop = stop_on_signals() if held else None
+        before = client.wait_for(lambda: client.task, MODE_PATIENCE_S)
         task = client.activate() if stop is None else client.activate_with_deadman("person")
+        # Every activation begins an episode: in the same one it was not this command's.
+        ours = before is None or not before.active or before.episode != task.episode
+        active = "active" if ours else "was active already"
         what = f"worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz"
-        _show(target, client, f"{_mode(client)} | active: {what}")
+        _show(target, client, f"{_mode(client)} | {active}: {what}")
         if stop is not None:
             _hold(target, client, task, stop)
 

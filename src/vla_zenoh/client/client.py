@@ -716,7 +716,8 @@ class Client(StopClient):
         Raises:
             SessionError: there is one that cannot be read.
         """
-        self.wait_for(lambda: self.task is not None or Task in self._unread, timeout_s)
+        if self.task is None:
+            self.wait_for(lambda: self.task is not None or Task in self._unread, timeout_s)
         if self.task is None and Task in self._unread:
             raise SessionError(
                 f"{what}: nothing was put, since what robot {self.keys.robot!r} does cannot be "

@@ -59,6 +59,18 @@ class Rig:
         """Publish on a topic below /vla."""
         self.peer.put(f"/vla/{name}", self.peer.message(kind, **values))
 
+    def tell_task(self, rate_hz: float) -> None:
+        """As a command node does."""
+        task = records.encode(Task(1, False, "", "scripted", rate_hz))
+        header = records.encode_header(Header(time.time_ns(), round(rate_hz), "command#1"))
+        self.operator.put(self.keys.task, task, attachment=header)
+
+        def heard() -> bool:
+            known = self.people._client.task
+            return known is not None and known.rate_hz == rate_hz
+
+        until("the task is heard", heard)
+
     def answer(self, nth: int) -> dict[str, Any]:
         """The nth answer."""
         until(f"answer {nth}", lambda: len(self.answers) > nth)
@@ -120,7 +132,9 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
             await_match(theirs, f"vla/{one.name}")
         thread = threading.Thread(target=people.run, args=(over,))
         thread.start()
-        yield Rig(people, peer, callers, operator, keys, heard, agreed, answers)
+        rig = Rig(people, peer, callers, operator, keys, heard, agreed, answers)
+        rig.tell_task(1.0)
+        yield rig
         agreed.set()
         over.set()
         thread.join()
@@ -159,10 +173,7 @@ def test_a_stop_of_anybody_counts(rig: Rig) -> None:
 def test_what_comes_last_in_a_request_is_not_done_after_a_stop_in_between(rig: Rig) -> None:
     call = rig.ask("set_request", "vla_msgs/srv/SetRequest", prompt="", rate_hz=5.0, active=True)
     rig.expect(("rate", "5"))
-    task = records.encode(Task(1, False, "", "scripted", 5.0))
-    header = records.encode_header(Header(time.time_ns(), 1, "command#1"))
-    rig.operator.put(rig.keys.task, task, attachment=header)
-    until("the rate is agreed to", lambda: rig.people._client.task)
+    rig.tell_task(5.0)
     stop = rig.ask("stop")
     rig.expect(("rate", "5"), ("stop", ""))
     rig.agreed.set()

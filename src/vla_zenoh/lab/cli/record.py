@@ -90,6 +90,11 @@ def record(
     _show(done[0], path, as_json)
     if not done[0].samples:
         fail("nothing was published; is a robot up? (`vla-zenoh up`)")
+    if done[0].unreadable:
+        fail(
+            f"{done[0].unreadable:,} samples cannot be read from this file by any vla-zenoh: "
+            f"{done[0].unreadable_why}, and record again"
+        )
     if short := {key: one for key, one in done[0].streams.items() if one.below(min_share)}:
         rows = [
             f"{loaded.keys.short(key)} {share.received} of {share.sent}"
@@ -116,6 +121,7 @@ def _show(recorded: RecordingResult, path: Path, as_json: bool) -> None:
                     key: {"announced": one.sent, "received": one.received, "lost": one.lost}
                     for key, one in recorded.streams.items()
                 },
+                "unreadable": recorded.unreadable,
                 "failure": recorded.failure,
             }
         )

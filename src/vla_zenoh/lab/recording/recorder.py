@@ -21,7 +21,8 @@ from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.reception import Share
 from vla_zenoh.bus.session import covers
-from vla_zenoh.errors import in_words
+from vla_zenoh.codec import records
+from vla_zenoh.errors import CodecError, in_words
 from vla_zenoh.keys import ENDED, Keys
 from vla_zenoh.lab.recording.sample import TEXT
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
@@ -63,6 +64,8 @@ class RecordingResult:
         dropped: samples by key that the disk was too slow for.
         streams: key -> samples that its sender announced in its status, and that are recorded.
         lost: samples by key that never arrived.
+        unreadable, unreadable_why: samples of another version of the wire, which no reader of this
+            file knows, and which side is to be updated.
         failure: why it ended early; empty if it did not.
     """
 
@@ -73,6 +76,8 @@ class RecordingResult:
     dropped: Counter[str] = field(default_factory=Counter)
     streams: dict[str, Share] = field(default_factory=dict)
     lost: Counter[str] = field(default_factory=Counter)
+    unreadable: int = 0
+    unreadable_why: str = ""
     failure: str = ""
 
 
@@ -225,11 +230,21 @@ class Recorder:
                 if sample.header is not None:
                     arrived = self._writer.counts[sample.key] + self._queue.dropped[sample.key]
                     self.node.traffic.received(sample.key, sample.header, arrived)
+                elif sample.attachment is not None:
+                    self._count_unreadable(sample.attachment)
             if time.monotonic() >= commit_s:
                 self._writer.commit()
                 commit_s = time.monotonic() + COMMIT_S
                 self._measure()
                 self._report(RECORDING)
+
+    def _count_unreadable(self, attachment: bytes) -> None:
+        try:
+            records.decode_header(attachment)
+        except CodecError as error:
+            if error.reason == "schema":
+                self.recorded.unreadable += 1
+                self.recorded.unreadable_why = str(error)
 
     def _count_lost(self) -> None:
         dropped, lost = self._queue.dropped, Counter(self.node.traffic.lost)
