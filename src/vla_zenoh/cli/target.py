@@ -147,6 +147,11 @@ class RobotTarget:
             where = ", ".join(client.profile.session.connect)
             return f"no Zenoh router answers at {where} any more; `vla-zenoh up` starts one"
         none = "No other robot is visible on this router; `vla-zenoh up` starts one"
+        if client.profile.session.security is not None:
+            none += (
+                ". Or they run, and the router grants this certificate nothing (revoked, or its "
+                "rights are older): `vla-zenoh doctor` tells"
+            )
         there = self.alive(client, *command) or none
         return f"no {kind} of {self.named(client)} is alive. {there}"
 

@@ -167,6 +167,20 @@ def test_an_authority_whose_key_others_can_read_signs_nothing(store: LabCertific
     assert not store.has("gpu", "worker-scripted")
 
 
+def test_beside_keys_whose_authority_is_not_there_no_second_one_is_made(
+    store: LabCertificates,
+) -> None:
+    store.add([WORKER], NOW)
+    for file in ("ca.key", "ca.pem", "gpu/ca.pem"):
+        (store.folder / file).unlink()
+    with pytest.raises(SecurityError, match=r"gpu/worker-scripted\.key is of an authority that is"):
+        store.make_authority("again", NOW)
+    assert not (store.folder / "ca.key").exists()
+    done = runner.invoke(app, ["secure", "show", "--folder", str(store.folder)])
+    assert done.exit_code == 1
+    assert "gpu lacks ca.pem: copy this host's folder from the computer" in done.output
+
+
 def test_a_router_that_is_renewed_serves_where_it_served(store: LabCertificates) -> None:
     store.add([ROUTER], NOW, addresses=["10.0.0.2"])
     store.add([ROUTER], NOW, addresses=["robot.lab"], renew=True)

@@ -339,9 +339,14 @@ def show(
         what = "retired" if robots[robot] is None else f"renamed to {robots[robot]}"
         warn(f"robot {robot} was {what}: routers of this lab deny its keys")
     if not entries:
-        fail(f"{store.folder} has no certificates; `vla-zenoh secure init` makes them")
+        if keys := store.keys_of_hosts():
+            fail(f"{keys[0].parent} lacks ca.pem: {COPY}")
+        fail(f"{store.folder} has no certificates: {COPY}, or run that if this is its first one")
     if any(entry.faults for entry in entries):
         raise typer.Exit(1)
+
+
+COPY = "copy this host's folder from the computer where `vla-zenoh secure init` was run"
 
 
 def _store(folder: str | None, security: SecurityProfile | None) -> LabCertificates:

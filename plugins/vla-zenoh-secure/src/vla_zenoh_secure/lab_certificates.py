@@ -25,13 +25,23 @@ FOLDER_MODE = 0o700
 class LabCertificates(CheckedStore):
     """Folder of a lab's certificates and keys, to make and to check them."""
 
+    def keys_of_hosts(self) -> list[Path]:
+        """Keys of all hosts, whether or not their other files are here."""
+        return sorted(self.folder.glob("*/*.key"))
+
     def make_authority(self, lab: str, now: dt.datetime) -> Path:
         """Make the lab's authority.
 
         Raises:
-            SecurityError: it exists already, or the folder cannot be written.
+            SecurityError: it exists already, or the folder cannot be written, or has certificates.
         """
         self._refuse_to_overwrite(self.files("", AUTHORITY))
+        if orphans := self.keys_of_hosts():
+            raise SecurityError(
+                f"{orphans[0]} is of an authority that is not here. A second one would make "
+                "certificates that the lab's routers reject: copy this host's folder again from "
+                "the computer where `vla-zenoh secure init` was run, or name a new --folder"
+            )
         return self._keep("", AUTHORITY, ca.make_authority(lab, now))
 
     def add(
