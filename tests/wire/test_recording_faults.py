@@ -164,6 +164,7 @@ def test_samples_of_another_version_of_the_wire_are_counted_with_what_to_update(
 
     def counted() -> bool:
         session.put(profile.keys.state_pose, b"", attachment=newer)
+        session.put(f"{profile.keys.state_pose}/theirs", b"", attachment=newer)
         session.put(profile.keys.prompt, b"go", attachment=b"of somebody else")
         return recorder.recorded.unreadable > 2
 

@@ -92,7 +92,7 @@ def record(
         fail("nothing was published; is a robot up? (`vla-zenoh up`)")
     if done[0].unreadable:
         fail(
-            f"{done[0].unreadable:,} samples cannot be read from this file by any vla-zenoh: "
+            f"{done[0].unreadable:,} records cannot be read from this file by any vla-zenoh: "
             f"{done[0].unreadable_why}, and record again"
         )
     if short := {key: one for key, one in done[0].streams.items() if one.below(min_share)}:

@@ -24,6 +24,7 @@ from vla_zenoh.bus.session import covers
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, in_words
 from vla_zenoh.keys import ENDED, Keys
+from vla_zenoh.lab.recording.record_types import record_of
 from vla_zenoh.lab.recording.sample import TEXT
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.lab.recording.writer import RecordingWriter
@@ -64,7 +65,7 @@ class RecordingResult:
         dropped: samples by key that the disk was too slow for.
         streams: key -> samples that its sender announced in its status, and that are recorded.
         lost: samples by key that never arrived.
-        unreadable, unreadable_why: samples of another version of the wire, which no reader of this
+        unreadable, unreadable_why: records of another version of the wire, which no reader of this
             file knows, and which side is to be updated.
         failure: why it ended early; empty if it did not.
     """
@@ -230,7 +231,7 @@ class Recorder:
                 if sample.header is not None:
                     arrived = self._writer.counts[sample.key] + self._queue.dropped[sample.key]
                     self.node.traffic.received(sample.key, sample.header, arrived)
-                elif sample.attachment is not None:
+                elif sample.attachment and record_of(self.node.keys.short(sample.key)):
                     self._count_unreadable(sample.attachment)
             if time.monotonic() >= commit_s:
                 self._writer.commit()
