@@ -716,9 +716,16 @@ class Client(StopClient):
         Raises:
             SessionError: there is one that cannot be read.
         """
-        if self.task is None:
-            self.wait_for(lambda: self.task is not None or Task in self._unread, timeout_s)
-        if self.task is None and Task in self._unread:
+
+        def reads() -> bool:
+            return self.task is not None and Task not in self._unread
+
+        def never_read() -> bool:
+            return self.task is None and Task in self._unread
+
+        if not reads():
+            self.wait_for(lambda: reads() or never_read(), timeout_s)
+        if Task in self._unread:
             raise SessionError(
                 f"{what}: nothing was put, since what robot {self.keys.robot!r} does cannot be "
                 f"read: {self._unread[Task]}"

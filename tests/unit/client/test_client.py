@@ -109,7 +109,7 @@ SETTINGS: dict[str, Callable[[Client], object]] = {
 }
 
 
-@pytest.mark.parametrize("theirs", ["another schema", "another task"])
+@pytest.mark.parametrize("theirs", ["another schema", "another task", "another since"])
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_a_robot_whose_task_cannot_be_read_is_told_nothing_but_a_stop(
     profile: Profile, monkeypatch: pytest.MonkeyPatch, setting: str, theirs: str
@@ -126,7 +126,9 @@ def test_a_robot_whose_task_cannot_be_read_is_told_nothing_but_a_stop(
         until("the node is there", lambda: "command" in client.alive)
         await_match(here, profile.keys.active)
         with monkeypatch.context() as patch:
-            if theirs == "another schema":
+            if theirs == "another since":
+                client.task = Task(1, False, "hold", "scripted", 5.0)
+            if theirs != "another task":
                 patch.setattr(keys, "SCHEMA", keys.SCHEMA + 1)
             else:
                 del task["episode"]
@@ -140,7 +142,8 @@ def test_a_robot_whose_task_cannot_be_read_is_told_nothing_but_a_stop(
 
         publishing = threading.Thread(target=publish)
         publishing.start()
-        why = "schema" if theirs == "another schema" else "Task lacks episode"
+        why = "Task lacks episode" if theirs == "another task" else "schema"
+        until("its task has come", lambda: Task in client._unread)
         with pytest.raises(SessionError, match=f"nothing was put, since .*: task: .*{why}"):
             SETTINGS[setting](client)
         client.stop()
