@@ -61,6 +61,11 @@ class Stream(Generic[Record, Buffer]):
                 return found
         return None
 
+    def restart(self) -> None:
+        """Drop the samples that wait, and accept the next of any writer: the last one is gone."""
+        self.buffer.drain()
+        self.writer.release()
+
     def close(self) -> None:
         """End the subscription."""
         self._node.unsubscribe(self.buffer)

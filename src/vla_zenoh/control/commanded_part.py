@@ -146,6 +146,11 @@ class CommandedPart:
             if self.held is not None and width_m is not None:
                 self._grasp_m = min(self._grasp_m, width_m)
 
+    def forget_states(self) -> None:
+        """Forget the states of a robot that is gone: the next may be another one, elsewhere."""
+        self.pose = self.joint = self.gripper_state = None
+        self.states.forget()
+
     # -- what it holds ------------------------------------------------------------------------
     @property
     def let_go(self) -> bool:
@@ -350,10 +355,10 @@ class CommandedPart:
 
     def keeps_from_retreat(self, part: PartSnapshot) -> str:
         """Why the arm must not retreat, empty: the robot is ready, and its state can be trusted."""
-        if part.pose is None or part.gripper is None:
-            return "its state is not known"
         if part.peers.robot_node not in part.peers.alive:
             return f"node {part.peers.robot_node!r} is gone"
+        if part.pose is None or part.gripper is None:
+            return "its state is not known"
         why = self.states.lost(part) or self.states.doubt
         return why or why_not_ready(part.gripper.record)
 

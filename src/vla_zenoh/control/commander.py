@@ -181,6 +181,9 @@ class Commander:
         if inputs.peers is not None:
             self._peers = inputs.peers
         for part in self.parts:
+            if self._peers.robot_node not in self._peers.alive:
+                part.forget_states()
+                continue
             states, before = inputs.of(part.name), part.gripper_state
             part.update(states)
             # Once, when it begins: after a reset the robot's last state may still say so.

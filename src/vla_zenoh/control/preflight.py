@@ -117,6 +117,10 @@ def reasons_of_part(
 
     `now_ns`, here and below, is on the clock of the records' ``received_ns``.
     """
+    if peers.robot_node not in peers.alive:
+        why_down = peers.why_down(peers.robot_node)
+        gone = f"the robot's node {peers.robot_node!r} is not alive{why_down}"
+        return [*_guesses(profile), gone]
     reasons = [*_guesses(profile), *_robot(profile, peers, pose, now_ns)]
     if gripper is None:
         return [*reasons, Passing("the gripper is not known: nothing received on state/gripper")]
@@ -279,14 +283,9 @@ def _guesses(profile: Profile) -> list[str]:
 def _robot(
     profile: Profile, peers: PeerSnapshot, pose: Stamped[PoseState] | None, now_ns: int
 ) -> list[str]:
-    reasons: list[str] = []
-    if peers.robot_node not in peers.alive:
-        reasons.append(
-            f"the robot's node {peers.robot_node!r} is not alive{peers.why_down(peers.robot_node)}"
-        )
     if pose is None:
-        return [*reasons, Passing("the TCP pose is not known: nothing received on state/pose")]
-    reasons += _too_old("TCP pose", pose, profile, now_ns)
+        return [Passing("the TCP pose is not known: nothing received on state/pose")]
+    reasons = _too_old("TCP pose", pose, profile, now_ns)
     delay_s = (pose.received_ns - pose.header.stamp_wall_ns) / 1e9
     tolerance_s = CLOCK_TOLERANCE_S + peers.uncertainty_s(peers.robot_node)
     if not -tolerance_s <= delay_s <= tolerance_s + profile.timing.state_timeout_s:

@@ -54,6 +54,12 @@ class StateMonitor(Monitor):
         self._arm = arm
         self._poses = poses
         self._wants_joints = wants_joints
+        self._contradicts_ns = 0
+        """Since when, on the clock of their arrival."""
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what was measured."""
         self.actual: Pose | None = None
         self._pose: Stamped[PoseState] | None = None
         self._jumped = ""
@@ -62,8 +68,6 @@ class StateMonitor(Monitor):
         self._before_jump: Pose | None = None
         self._contradiction = ""
         """Why the measured pose or the joints are false."""
-        self._contradicts_ns = 0
-        """Since when, on the clock of their arrival."""
 
     @property
     def doubt(self) -> str:

@@ -646,6 +646,28 @@ def test_a_robot_that_leaves_its_ready_mode_ends_the_activation() -> None:
     assert "not ready but 'guiding'" in rig.commander.why
 
 
+def test_a_robot_that_is_back_is_activated_where_it_is_now_and_not_where_the_last_one_was() -> None:
+    rig = moving_rig()
+    whole = rig.peers
+    rig.peers = replace(whole, alive=whole.alive - {"sim"})
+    rig.tick()
+    rig.run(1.5)
+    elsewhere_m = rig.position_m = START_M + [0.0, 0.05, 0.0]
+    rig.blocked = rig.silent = True
+    rig.peers = whole
+    rig.tick(Setting("active", True), chunks=[rig.chunk([STAND])])
+    assert rig.state == "inactive"
+    assert {event.why for event in rig.events if event.what == "activate_refused"} == {
+        "the TCP pose is not known: nothing received on state/pose",
+        "the gripper is not known: nothing received on state/gripper",
+        "the last activation ended: node 'sim' is gone",
+    }
+    rig.silent, rig.reference = False, None
+    rig.activate()
+    rig.tick()
+    np.testing.assert_allclose(rig.commands[-1].position_m, elsewhere_m, atol=1e-12)
+
+
 @pytest.mark.parametrize("node", ["sim", "camera", "worker-scripted"])
 def test_a_node_that_is_gone_ends_the_activation_and_coming_back_does_not_renew_it(
     node: str,

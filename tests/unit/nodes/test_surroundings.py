@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from camera_rig import await_match, free_endpoint, until
+from camera_rig import PATIENCE_S, await_match, free_endpoint, until
 from command_rig import model_spec
 
 from vla_zenoh.bus import clock as offsets
@@ -19,9 +19,9 @@ from vla_zenoh.codec import records
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.keys import ON_BEHALF, STARTING, Kind
 from vla_zenoh.nodes.command import inputs
-from vla_zenoh.nodes.command.inputs import MAX_WORKERS, PeerMonitor
+from vla_zenoh.nodes.command.inputs import MAX_WORKERS, CommandInputs, PeerMonitor
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.types import Header, NodeStatus
+from vla_zenoh.types import GripperState, Header, NodeStatus, Stamped
 
 ROOM_S = 0.3
 """How long a made-up name keeps its place in this test."""
@@ -305,3 +305,29 @@ def test_a_deadman_and_a_node_that_were_gone_between_two_polls_are_gone_for_one(
     assert "extra" in second.alive
     for token in tokens:
         token.undeclare()
+
+
+def test_a_robot_that_is_back_is_heard_at_once_however_long_the_last_one_may_be_silent() -> None:
+    endpoint = free_endpoint()
+    profile = override(
+        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    )
+    timing = profile.timing.model_copy(update={"state_timeout_s": 10 * PATIENCE_S})
+    profile = profile.model_copy(update={"timing": timing})
+    with open_session(profile.session, mode="router"), open_session(profile.session) as here:
+        command = Node("command", profile, here)
+        heard = CommandInputs(command)
+        for width_m in (0.01, 0.02):  # of a robot that lives until it is heard
+            with open_session(profile.session) as there:
+                robot = Node("sim", profile, there)
+                publisher = robot.declare_publisher(robot.keys.state_gripper, Kind.STATE)
+                state = GripperState(width_m, moving=False, holding=False)
+
+                def gripper(
+                    publisher: Publisher = publisher, state: GripperState = state
+                ) -> Stamped[GripperState] | None:
+                    publisher.publish(state)
+                    return heard.poll(command.clock.wall_ns()).gripper
+
+                assert until("its state", gripper).record.width_m == width_m
+        command.close()

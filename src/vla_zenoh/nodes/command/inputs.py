@@ -80,6 +80,7 @@ class CommandInputs:
             for name, size, limit, decode in SETTINGS
         ]
         self._last_clock = 0.0
+        self._robot_alive = False
 
     def read_news(self, now_ns: int) -> None:
         """Read status and specs of the other nodes, for the next `poll`."""
@@ -92,6 +93,11 @@ class CommandInputs:
         """
         settings_put = self._poll_settings()
         peers = self._peer_monitor.snapshot(now_ns)
+        if peers is not None:
+            self._robot_alive = peers.robot_node in peers.alive
+        if not self._robot_alive:
+            for part in self._parts.values():
+                part.restart()
         inputs = self.poll_streams(settings_put, take_chunks=take_chunks)
         inputs.settings, inputs.peers = [*settings_put, *self._check_clock()], peers
         return inputs
@@ -185,6 +191,11 @@ class _PartInputs:
         self._gripper = stream(keys.state_gripper, GripperState)
         self.held = node.subscribe(keys.held, ZenohRing(16, WORDS))
         self._last_joint = 0.0
+
+    def restart(self) -> None:
+        """Drop what arrived; the next states may be of any source: the robot's node is gone."""
+        for stream in (self._pose, self._joint, self._gripper):
+            stream.restart()
 
     def poll(self, requested: bool) -> NewStates:
         """The newest states; joints, which are expensive to decode, every `JOINT_PERIOD_S` and when
