@@ -11,11 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arm_rig import (
-    BRAKE,
     HOLD,
-    LOST,
-    OWN,
-    SILENT,
     SPEED_M_S,
     STARTED_S,
     STARVED,
@@ -25,25 +21,21 @@ from arm_rig import (
     Asked,
     after,
     begin,
-    changed,
     check_motion,
     check_stop,
     chunks_only,
     delayed,
-    early,
-    goes_on,
     later,
     mark,
     moving,
     path_m,
     speed_m_s,
-    spoilt,
     undisturbed,
     way_m,
     with_fields,
 )
-from vla_zenoh_benchmarks.lockstep.loop import CAMERA, COMMAND, SIM, Lockstep
-from vla_zenoh_benchmarks.lockstep.worker import Message, Tamper
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Message
 
 from vla_zenoh.codec import message
 from vla_zenoh.types import (
@@ -79,16 +71,6 @@ def test_late_chunks_cost_time_and_no_way() -> None:
     check_motion(loop)
 
 
-def test_chunks_that_are_too_late_are_nothing_and_the_arm_stops() -> None:
-    loop = moving(steps=1)
-    since = mark(loop)
-    loop.tamper = delayed(1.2, ActionChunk)
-    loop.run(1.9)
-    assert loop.refused["stale"] > 5
-    check_stop(loop, since, STARVED)
-    check_motion(loop)
-
-
 def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm() -> None:
     first: dict[str, Message] = {}
 
@@ -104,17 +86,6 @@ def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm() -> None
     (event,) = [event for event in loop.events if event.what == "same_image"]
     assert "while the arm moves" in event.why
     assert speed_m_s(loop)[-1] < STILL_M_S
-    check_motion(loop)
-
-
-@pytest.mark.long
-def test_chunks_from_the_future_are_nothing_and_the_arm_stops() -> None:
-    loop = moving(steps=1)
-    since = mark(loop)
-    loop.tamper = early
-    loop.run(0.7)
-    assert loop.refused["future"] > 5
-    check_stop(loop, since, STARVED)
     check_motion(loop)
 
 
@@ -171,64 +142,6 @@ def test_a_heap_of_chunks_after_a_pause_is_not_made_up_for() -> None:
     check_motion(loop)
 
 
-@pytest.mark.parametrize(
-    ("node", "step_s"),
-    [
-        (CAMERA, 2.0),
-        (WORKER, -2.0),
-        pytest.param(CAMERA, -2.0, marks=pytest.mark.long),
-        pytest.param(WORKER, 2.0, marks=pytest.mark.long),
-    ],
-)
-def test_a_clock_of_camera_or_worker_that_jumps_stops_the_arm_until_it_is_right(
-    node: str, step_s: float
-) -> None:
-    loop = moving(steps=1)
-    since = mark(loop)
-    loop.set_clock(node, step_s)
-    loop.run(0.45)
-    check_stop(loop, since, STARVED)
-    loop.set_clock(node, 0.0)
-    loop.run(0.5)
-    assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
-    check_motion(loop)
-
-
-@pytest.mark.parametrize("step_s", [2.0, pytest.param(-2.0, marks=pytest.mark.long)])
-def test_a_clock_of_the_command_node_that_jumps_stops_the_arm(step_s: float) -> None:
-    loop = moving()
-    since = mark(loop)
-    loop.set_clock(COMMAND, step_s)
-    loop.run(0.4)
-    check_stop(loop, since, BRAKE)
-    loop.put("active", True)
-    loop.run(0.2)  # its clock differs from the others', so it is not given the arm
-    loop.set_clock(COMMAND, 0.0)
-    loop.run(0.2)
-    assert way_m(loop, since) < BRAKE[1]
-    goes_on(loop)
-    check_motion(loop)
-
-
-@pytest.mark.parametrize(
-    ("step_s", "within"),
-    [(2.0, OWN), (-2.0, BRAKE)],
-)
-def test_a_clock_of_the_robot_that_jumps_stops_the_arm(
-    step_s: float, within: tuple[float, float]
-) -> None:
-    loop = moving(steps=1)
-    since = mark(loop)
-    loop.set_clock(SIM, step_s)
-    loop.run(0.4)
-    check_stop(loop, since, within)
-    loop.set_clock(SIM, 0.0)
-    loop.run(0.2)
-    assert way_m(loop, since) < within[1]
-    goes_on(loop)
-    check_motion(loop, own_brake=step_s > 0)
-
-
 def test_a_second_worker_moves_nothing_while_the_first_has_the_arm() -> None:
     loop = begin(UP, others={"other": Asked("other", horizon=8)})
     for duration_s in (STARTED_S, AFTER_S):
@@ -248,27 +161,6 @@ def test_a_second_process_under_the_name_of_the_worker_moves_nothing() -> None:
 
 # -- NaN, infinity, quaternions -------------------------------------------------------------------
 NO_ROTATION = {"quat_xyzw": np.array([0.9, 0.0, 0.0, 0.0])}
-
-
-@pytest.mark.parametrize(
-    ("kind", "tamper", "within"),
-    [
-        pytest.param(ActionChunk, spoilt(ActionChunk, "steps"), STARVED, marks=pytest.mark.long),
-        (PoseState, spoilt(PoseState, "position_m"), LOST),
-        pytest.param(GripperState, spoilt(GripperState, "width_m"), LOST, marks=pytest.mark.long),
-        (PoseCommand, changed(PoseCommand, **NO_ROTATION), SILENT),
-    ],
-)
-def test_numbers_that_are_none_or_no_rotation_stop_the_arm(
-    kind: type, tamper: Tamper, within: tuple[float, float]
-) -> None:
-    loop = moving()
-    since = mark(loop)
-    loop.tamper = tamper
-    loop.run(0.5)
-    assert loop.refused["invalid"] > 0
-    check_stop(loop, since, within)
-    check_motion(loop, own_brake=kind is PoseCommand)
 
 
 def test_the_undisturbed_arm_keeps_the_speed_that_is_asked_for() -> None:

@@ -21,7 +21,6 @@ from arm_rig import (
     begin,
     changed,
     check_motion,
-    check_stop,
     dropped,
     goes_on,
     mark,
@@ -94,23 +93,6 @@ def test_a_rate_that_changes_in_motion_loses_no_step() -> None:
     loop.run(0.8)
     way = path_m(loop)[-1] - path_m(loop)[0]
     assert way == pytest.approx([0.0, 0.0, STEP_M / 2 * steps], abs=EXACT_M)
-    check_motion(loop)
-
-
-def test_stop_in_motion_stops_the_arm_and_only_a_reset_frees_it() -> None:
-    loop = moving()
-    since = mark(loop)
-    loop.put("stop")
-    loop.run(0.3)
-    assert loop.commander.state.value == "stopped"
-    assert loop.commander.at_rest
-    loop.put("active", True)
-    loop.run(0.3)
-    check_stop(loop, since, BRAKE)
-    loop.put("reset")
-    loop.run(0.2)
-    assert way_m(loop, since) < BRAKE[1]
-    goes_on(loop)
     check_motion(loop)
 
 

@@ -8,23 +8,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-import pytest
 from arm_rig import (
-    BRAKE,
-    FROZEN,
-    LOST,
-    SILENT,
     SPEED_M_S,
     STILL_M_S,
     UP,
     activate,
     after,
     begin,
-    changed,
     check_motion,
-    check_stop,
     dropped,
-    frozen,
     goes_on,
     mark,
     moving,
@@ -35,12 +27,12 @@ from arm_rig import (
     way_m,
     with_fields,
 )
-from vla_zenoh_benchmarks.lockstep.loop import SIM, Lockstep
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 from vla_zenoh_benchmarks.lockstep.worker import Message, Tamper
 
 from vla_zenoh.codec import message
 from vla_zenoh.kinematics.so3 import norm3
-from vla_zenoh.types import GripperCommand, GripperState, JointState, PoseCommand, PoseState
+from vla_zenoh.types import GripperState, JointState, PoseCommand, PoseState
 
 PUSH_N = 150.0
 """At most, on what is in the way: stiffness times `tracking_m`, and what the brake adds."""
@@ -50,37 +42,6 @@ STANDS_M = 1e-3
 LOST_M = 0.006
 """Further than a stream may begin aside of the reference, far less than `tracking_m`."""
 STATES = (PoseState, GripperState, JointState)
-
-
-def test_without_robot_state_the_arm_stops() -> None:
-    loop = moving()
-    since = mark(loop)
-    loop.tamper = dropped(*STATES)
-    loop.run(0.5)
-    check_stop(loop, since, LOST)
-    loop.tamper = None
-    loop.run(0.2)
-    assert way_m(loop, since) < LOST[1]
-    goes_on(loop)
-    check_motion(loop)
-
-
-def test_a_state_that_is_said_again_and_again_stops_the_arm() -> None:
-    loop = moving()
-    since = mark(loop)
-    loop.tamper = frozen(*STATES, payload_only=False)
-    loop.run(0.5)
-    check_stop(loop, since, LOST)
-    check_motion(loop)
-
-
-def test_a_sensor_that_is_stuck_stops_the_arm() -> None:
-    loop = moving()
-    since = mark(loop)
-    loop.tamper = frozen(PoseState, payload_only=True)
-    loop.run(0.6)
-    check_stop(loop, since, FROZEN)
-    check_motion(loop)
 
 
 def shifted(by_m: float) -> Tamper:
@@ -97,15 +58,6 @@ def shifted(by_m: float) -> Tamper:
 
 def test_a_measured_pose_that_jumps_a_little_moves_nothing() -> None:
     np.testing.assert_array_equal(after(0.5, shifted(0.02)), undisturbed(0.5))
-
-
-def test_a_measured_pose_that_jumps_far_stops_the_arm() -> None:
-    loop = moving(1.2)
-    since = mark(loop)
-    loop.tamper = shifted(0.2)
-    loop.run(0.4)
-    check_stop(loop, since, BRAKE)
-    check_motion(loop)
 
 
 def test_an_arm_that_is_blocked_pushes_no_harder_than_it_may_and_is_led_back() -> None:
@@ -142,69 +94,6 @@ def test_an_arm_pressed_on_the_table_stops() -> None:
     assert norm3(loop.world.wrench()[:3]) < LASTING_N
     assert rest_m[2] > 0.06
     check_motion(loop, contact=True)
-
-
-@pytest.mark.parametrize("mode", ["user_stopped", pytest.param("guiding", marks=pytest.mark.long)])
-def test_a_robot_that_is_switched_to_another_mode_stops_and_waits(mode: str) -> None:
-    loop = moving()
-    since = mark(loop)
-    loop.tamper = changed(GripperState, mode=mode)
-    loop.run(0.4)
-    check_stop(loop, since, BRAKE)
-    loop.put("active", True)
-    loop.run(0.2)
-    loop.tamper = None
-    loop.run(0.2)
-    assert way_m(loop, since) < BRAKE[1]  # being ready again does not start it
-    goes_on(loop)
-    check_motion(loop)
-
-
-def test_a_robot_that_is_switched_off_and_on_moves_again_only_when_it_is_told() -> None:
-    loop = moving()
-    since = mark(loop)
-    loop.alive.discard(SIM)
-    loop.tamper = dropped(*STATES, PoseCommand, GripperCommand)
-    loop.run(0.5)
-    check_stop(loop, since, SILENT)
-    loop.put("active", True)
-    loop.run(0.2)
-    loop.guard.reset()
-    loop.alive.add(SIM)
-    loop.tamper = None
-    loop.run(0.3)
-    assert way_m(loop, since) < SILENT[1]
-    goes_on(loop)
-    check_motion(loop, own_brake=True)
-
-
-def test_a_camera_that_lies_ends_the_motion_and_has_to_be_good_again_to_activate() -> None:
-    loop = moving()
-    since = mark(loop)
-    loop.camera_faults["front"] = "shows the same picture since 1.0 s"
-    loop.run(0.4)
-    assert loop.commander.why == "camera 'front' shows the same picture since 1.0 s"
-    check_stop(loop, since, BRAKE)
-    loop.put("active", True)
-    loop.run(0.1)
-    assert loop.commander.state.value == "inactive"
-    loop.camera_faults.clear()
-    goes_on(loop)
-    check_motion(loop)
-
-
-def test_without_commands_the_robot_brakes_by_itself_and_nothing_jumps_afterwards() -> None:
-    loop = moving(1.2)
-    since = mark(loop)
-    loop.tamper = dropped(PoseCommand)
-    loop.run(0.3)
-    check_stop(loop, since, SILENT)
-    loop.tamper = None
-    standing = mark(loop)
-    loop.run(0.1)  # the command node still streams where its own brake ended
-    assert way_m(loop, standing) < STANDS_M
-    goes_on(loop)
-    check_motion(loop, own_brake=True)
 
 
 def test_a_stream_whose_beginning_is_lost_moves_nothing_and_ends_the_activation() -> None:
