@@ -41,10 +41,11 @@ RUBBISH = 10_000
 
 def pytest_configure() -> None:
     """End at once where this environment lacks a plug-in of this checkout: nothing would load."""
+    there = entry_points()
     for file in [ROOT / "pyproject.toml", *(ROOT / "plugins").glob("*/pyproject.toml")]:
         project = tomllib.loads(file.read_text("utf-8"))["project"]
         for group, wanted in project.get("entry-points", {}).items():
-            if lacking := sorted(wanted.keys() - entry_points(group=group).names):
+            if lacking := sorted(wanted.keys() - there.select(group=group).names):
                 names = ", ".join(lacking)
                 raise pytest.UsageError(f"{group} lacks {names} of {file}: run `make setup`")
 

@@ -132,6 +132,7 @@ class KinematicPanda:
         topic: of its pose goals.
         kind: their type, with a field ``pose``.
         rate_hz: of joint states.
+        clock_ns: how far its clock is ahead.
     """
 
     def __init__(
@@ -140,6 +141,7 @@ class KinematicPanda:
         topic: str = "/panda/panda_cartesian_impedance_controller/desired_pose",
         kind: str = GOAL,
         rate_hz: float = 100.0,
+        clock_ns: int = 0,
     ) -> None:
         self.peer, self._period_s = peer, 1.0 / rate_hz
         self._kinematics = panda()
@@ -149,7 +151,7 @@ class KinematicPanda:
         self.goals: list[Any] = []
         self.goal_times_s: list[float] = []
         self._followed: Any = None
-        self.clock_ns = 0
+        self.clock_ns = clock_ns
         self.silent = self.frozen = False
         self.alter: Callable[[dict[str, Any]], None] = lambda fields: None
         self._stop = threading.Event()

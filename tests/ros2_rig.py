@@ -8,7 +8,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
+import pytest
 import zenoh
 from camera_rig import PATIENCE_S, free_endpoint, until
 from ros2_peer import KinematicPanda, Ros2Peer
@@ -27,6 +29,8 @@ CAMERA = "/camera/realsense2_camera/color/image_raw"
 WIDTH, HEIGHT = 64, 48
 COMMAND_HZ = 100
 """Of a node that runs in real time."""
+STATUS_PERIOD_S = 0.1
+"""Nearly every test waits for a status."""
 PROFILE = """\
 extends: panda_ros2
 cameras:
@@ -120,20 +124,29 @@ class Ros2Rig:
 
 @contextmanager
 def ros2_rig(
-    folder: Path, bridge: str = "ros2dds", more: str = "", *, depth: bool = False
+    folder: Path,
+    bridge: str = "ros2dds",
+    more: str = "",
+    *,
+    depth: bool = False,
+    clock_ns: int = 0,
 ) -> Iterator[Ros2Rig]:
     """The node, in a thread, and a kinematic Panda on the other side."""
     path = write_profile(folder, bridge, more, depth=depth, command_hz=COMMAND_HZ)
     profile = load_profile(str(path))
     with (
+        pytest.MonkeyPatch.context() as patched,
         open_session(profile.session, mode="router"),
         open_session(profile.session) as theirs,
         open_session(profile.session) as ours,
         open_session(profile.session) as watcher,
     ):
+        patched.setattr("vla_zenoh.bus.node.STATUS_PERIOD_S", STATUS_PERIOD_S)
+        patched.setattr("vla_zenoh.robots.node.REPLIES", 0)  # nobody else has its name
+        patched.setattr("vla_zenoh.robots.node.gc", Mock())  # this process has more than a node
         peer = Ros2Peer(theirs, bridge)
         node = RobotNode(Ros2Driver(profile), ours)
-        robot = KinematicPanda(peer)
+        robot = KinematicPanda(peer, clock_ns=clock_ns)
         rig = Ros2Rig(profile, node, watcher, ours, peer, robot)
         keys = profile.keys
         subscribers = [
