@@ -157,6 +157,10 @@ class Traffic:
 
 PERIOD_S = 0.25
 """An event of one kind is published at most this often; `count` says how many it stands for."""
+LONGEST_S = 5.0
+"""A sender who mends one mistake and makes another of its kind is told of it by then."""
+ANSWER = "_refused"
+"""End of the names of rejected settings, whose sender waits for the reasons."""
 
 Kind = tuple[str, str, str]
 
@@ -165,22 +169,25 @@ class EventThrottle:
     """Decides when an event is published.
 
     Transitions always are. Everything else is published at once or, while one of its kind has just
-    been, late: nothing is left out, because a client may wait for the answer. A kind is remembered
-    until `PERIOD_S` after its last event, so memory is bounded by how many the node can receive in
-    that time, and no client can make it forget what it owes to another.
+    been, late: nothing is left out, because a client may wait for the answer. Between two events of
+    a kind are `PERIOD_S`. Rejections of samples may go on for hours, as while another version of
+    the wire writes: their periods double, up to `LONGEST_S`, until there was none for a period.
+    A kind is remembered for that long, so memory is bounded by how many the node can receive in
+    `PERIOD_S`, and no client can make it forget what it owes to another.
     """
 
     def __init__(
         self, publish: Callable[[Event], Any], clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._publish, self._clock = publish, clock
-        self._published_s: dict[Kind, float] = {}
+        self._next_s: dict[Kind, float] = {}
+        self._period_s: dict[Kind, float] = {}
         self._owed: dict[Kind, Event] = {}
         """Newest event of a kind that waits, with the count of all that do."""
 
     def emit(self, event: Event, about: str = "") -> None:
         """Publish an event, or keep it for `poll`; each `about` is throttled by itself."""
-        if event.what.endswith("_refused"):  # every reason against a setting, not only the first
+        if event.what.endswith(ANSWER):  # every reason against a setting, not only the first
             about = event.why
         kind = (event.kind, event.what, about)
         waiting = self._owed.get(kind)
@@ -194,12 +201,17 @@ class EventThrottle:
         """Publish what is due."""
         for kind in [kind for kind in self._owed if self._is_due(kind)]:
             self._send(kind)
-        for kind in [kind for kind in self._published_s if self._is_due(kind)]:
-            del self._published_s[kind]
+        for kind in [kind for kind in self._next_s if self._is_due(kind)]:
+            del self._next_s[kind], self._period_s[kind]
 
     def _is_due(self, kind: Kind) -> bool:
-        return self._clock() - self._published_s.get(kind, -math.inf) >= PERIOD_S
+        return self._clock() >= self._next_s.get(kind, -math.inf)
 
     def _send(self, kind: Kind) -> None:
-        self._published_s[kind] = self._clock()
-        self._publish(self._owed.pop(kind))
+        event = self._owed.pop(kind)
+        period_s = PERIOD_S
+        if event.kind == "refusal" and not event.what.endswith(ANSWER):
+            period_s = min(2.0 * self._period_s.get(kind, PERIOD_S / 2.0), LONGEST_S)
+        self._period_s[kind] = period_s
+        self._next_s[kind] = self._clock() + period_s
+        self._publish(event)

@@ -183,9 +183,9 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
     tls = settings["transport"]["link"].get("tls")
     if tls is not None:
         return SessionError(
-            f"no Zenoh router answers at {where}, or it rejects the certificate "
-            f"{tls['connect_certificate']}. Check that with `vla-zenoh secure show`; "
-            "start a router with `vla-zenoh node router` or `vla-zenoh up`"
+            f"no Zenoh router answers at {where}, or it and {tls['connect_certificate']} with its "
+            "key and ca.pem do not fit. Check both with `vla-zenoh secure show`, here and on the "
+            "router's host; start a router with `vla-zenoh node router` or `vla-zenoh up`"
         )
     return SessionError(
         f"no Zenoh router answers at {where}. Start one with `vla-zenoh node router`, or all "

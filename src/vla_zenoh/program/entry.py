@@ -106,6 +106,8 @@ def _sentence(error: Exception) -> str | None:
         return str(error)
     if isinstance(error, RuntimeError) and str(error).startswith(NO_HOME):
         return "this user has no home folder: set HOME"
+    if isinstance(error, OSError) and error.filename is not None:  # permissions, disk, names
+        return f"{error.filename}: {error.strerror}"
     if not isinstance(error, ImportError):
         return None
     extra = EXTRA_OF.get((error.name or "").partition(".")[0])

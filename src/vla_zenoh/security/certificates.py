@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import datetime as dt
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from vla_zenoh.errors import MissingExtraError, SecurityError, counted
 from vla_zenoh.profile import Profile
+from vla_zenoh.profile.schema import ANYWHERE, address_of, host_of
 from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.names import read_names
 from vla_zenoh.security.roles import identities
@@ -162,17 +164,31 @@ def load_pair(
 
 
 def read_file(path: Path) -> bytes:
-    """Content of a file, or a `SecurityError`."""
+    """Text of a PEM file, or a `SecurityError`."""
     try:
-        return path.read_bytes()
+        pem = path.read_bytes()
     except OSError as error:
         raise SecurityError(f"{path} cannot be read: {error.strerror}") from error
+    if not re.search(rb"^-----BEGIN", pem, re.MULTILINE):  # Zenoh would find nothing in it
+        raise SecurityError(f"{path} has no line that begins with -----BEGIN")
+    return pem
 
 
-def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
-    """Certificates whose traffic the router drops: file -> what to do.
+def router_names(profile: Profile) -> list[str]:
+    """Names and addresses at which a profile looks for its routers."""
+    session = profile.session
+    endpoints = [*session.connect, *session.listen]
+    for host in profile.hosts.values():
+        endpoints += [*(host.connect or ()), *(host.listen or ()), *(host.link or ())]
+    named = [host_of(one) for one in endpoints if not address_of(one).startswith(ANYWHERE)]
+    return [name for name in dict.fromkeys(named) if name]
 
-    There are some after a role was reduced or a node was removed from the profile.
+
+def unfit_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
+    """Certificates that do not fit the profile any more: file -> why, and what to do.
+
+    The router drops the traffic of some, after a role was reduced or a node was removed; no client
+    trusts those of a router that has another address now.
     """
     security = profile.session.security
     people = security.people if security is not None else {}
@@ -185,4 +201,11 @@ def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path
             out[entry.path] = (
                 f"is not known to profile {profile.name}{given}: delete it here and on {entry.host}"
             )
+        elif entry.certificate is not None and (valid := entry.certificate.addresses):
+            lacks = ", ".join(name for name in router_names(profile) if name not in valid)
+            if lacks:
+                out[entry.path] = (
+                    f"is not valid for {lacks}, where {profile.name} looks for a router: "
+                    f"`vla-zenoh secure add {entry.host} --renew`, and copy it"
+                )
     return out

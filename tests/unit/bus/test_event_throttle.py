@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.bus.metrics import PERIOD_S, EventThrottle
+from vla_zenoh.bus.metrics import LONGEST_S, PERIOD_S, EventThrottle
 from vla_zenoh.types import Event
 
 MADE_UP = 2000
@@ -105,3 +106,31 @@ def test_what_is_no_answer_is_counted_in_the_end_as_well() -> None:
     desk.now_s += PERIOD_S
     desk.news.poll()
     assert desk.counts == [1, 4]
+
+
+def test_a_rejection_that_goes_on_for_an_hour_is_told_every_five_seconds_and_anew_after_it() -> (
+    None
+):
+    desk = Desk()
+    for _ in range(36_000):
+        desk.news.emit(MALFORMED, "delta/a")
+        desk.now_s += 0.1
+        desk.news.poll()
+    assert len(desk.read) < 3600 / LONGEST_S + 10
+    desk.now_s += LONGEST_S
+    desk.news.poll()
+    assert sum(desk.counts) == 36_000
+    desk.now_s += LONGEST_S
+    desk.news.poll()
+    desk.news.emit(MALFORMED, "delta/a")
+    assert desk.counts[-1] == 1
+
+
+@pytest.mark.parametrize("kind", ["limit", "notice", "fault"])
+def test_what_limits_the_arm_is_told_four_times_a_second(kind: str) -> None:
+    desk = Desk()
+    for _ in range(100):
+        desk.news.emit(Event("warning", kind, "joint_limit", "slower"))
+        desk.now_s += 0.1
+        desk.news.poll()
+    assert len(desk.read) >= 10.0 / (PERIOD_S + 0.1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from typed import typed
 from vla_zenoh.cli import target
 
 USAGE, FAILED = 2, 1
+ROOT, NOBODY = 0, 65534
 NOWHERE = ("--connect", "tcp/127.0.0.1:9")
 
 WRONG: list[tuple[str, int, str]] = [
@@ -264,3 +266,31 @@ def test_a_user_without_a_home_is_told_to_set_it(
     monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
     done = typed(capsys, *words.split())
     assert (done.code, done.said) == (FAILED, "error: this user has no home folder: set HOME")
+
+
+@pytest.mark.parametrize("command", ["replay", "eval"])
+def test_a_file_that_the_system_refuses_is_an_error_with_its_reason(
+    capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    name = "a" * 300
+    done = typed(capsys, command, name)
+    assert (done.code, done.said) == (FAILED, f"error: {name}: File name too long")
+
+
+def test_a_folder_that_this_user_may_not_enter_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    closed = tmp_path / "lab"
+    closed.mkdir(mode=0)
+    words = ("secure", "show", "--folder", str(closed))
+    typed(capsys, *words)  # imports what it needs
+    user = os.geteuid()
+    if user == ROOT:  # which may enter any folder
+        os.seteuid(NOBODY)
+    try:
+        done = typed(capsys, *words)
+    finally:
+        os.seteuid(user)
+    assert done.code == FAILED
+    assert done.said.startswith(f"error: {closed}")
+    assert done.said.endswith(": Permission denied")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import datetime as dt
 import json
 import stat
@@ -13,14 +14,19 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from typer.testing import CliRunner
 from vla_zenoh_secure import authority as ca
 from vla_zenoh_secure.lab_certificates import LabCertificates
-from vla_zenoh_secure.secure_profile import moved_hosts, profile_text, with_operator
+from vla_zenoh_secure.secure_profile import (
+    moved_hosts,
+    profile_text,
+    serving_addresses,
+    with_operator,
+)
 
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.profile import load_profile, override
+from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.program.main import app
 from vla_zenoh.security import certificates
-from vla_zenoh.security.certificates import unused_certificates
-from vla_zenoh.security.roles import Identity, Role, operator_identities
+from vla_zenoh.security.certificates import unfit_certificates
+from vla_zenoh.security.roles import Identity, Role, identities, operator_identities
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)
 ROUTER = Identity(Role.ROUTER, "router", "robot")
@@ -239,7 +245,7 @@ def test_people_who_were_given_less_show_that_and_are_told_what_else_lies_there(
     lab = override(load_profile("panda_sim"), {"session": session})
     found = store.identity_files("desk", None, {"desk": "viewer"})
     assert found.certificate.name == "viewer.pem"
-    told = unused_certificates(lab, store.entries(NOW))
+    told = unfit_certificates(lab, store.entries(NOW))
     assert sorted(path.name for path in told) == ["operator.pem", "worker-teleop.pem"]
     assert "where people at desk are viewer: delete it" in told[store.folder / "desk/operator.pem"]
     found.certificate.unlink()
@@ -247,17 +253,37 @@ def test_people_who_were_given_less_show_that_and_are_told_what_else_lies_there(
         store.identity_files("desk", None, {"desk": "viewer"})
 
 
+def test_a_router_that_has_another_address_than_its_certificate_is_told(
+    store: LabCertificates,
+) -> None:
+    def lab(*endpoints: str) -> Profile:
+        session = {"listen": ["tls/0.0.0.0:7447"], "connect": [*endpoints]}
+        secured = {**session, "security": {"folder": str(store.folder)}}
+        return override(load_profile("panda_sim"), {"session": secured})
+
+    before, after = lab("tls/10.0.0.2:7447"), lab("tls/10.0.0.2:7447", "tls/robot.lab:7447")
+    store.add(identities(before), NOW, addresses=serving_addresses(before))
+    entries = store.entries(NOW)
+    assert unfit_certificates(before, entries) == {}
+    ((path, why),) = unfit_certificates(after, entries).items()
+    assert path.name == "router.pem"
+    assert why.startswith("is not valid for robot.lab, where panda_sim looks for a router")
+
+
 def test_what_is_wrong_with_each_file_is_told(store: LabCertificates) -> None:
     store.add([WORKER, ROUTER], NOW)
     good = store.files("gpu", "worker-scripted")
     bad = store.files("robot", "router")
     bad.certificate.write_bytes(good.certificate.read_bytes())
-    (bad.certificate.parent / "old.pem").write_text("rubbish")
+    (bad.certificate.parent / "old.pem").write_text("-----BEGIN rubbish")
+    marked = bad.certificate.parent / "marked.pem"
+    marked.write_bytes(codecs.BOM_UTF8 + good.certificate.read_bytes())
     faults = {entry.path.name: "; ".join(entry.faults) for entry in store.entries(NOW)}
     assert faults["ca.pem"] == faults["worker-scripted.pem"] == ""
     assert "is about 'worker-scripted@gpu'" in faults["router.pem"]
     assert "router.key belongs to another certificate" in faults["router.pem"]
     assert "not a certificate" in faults["old.pem"]
+    assert "no line that begins with -----BEGIN" in faults["marked.pem"]
 
 
 # -- the profile ------------------------------------------------------------------------------

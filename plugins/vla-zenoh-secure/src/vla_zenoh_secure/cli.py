@@ -36,7 +36,7 @@ from vla_zenoh.profile.load import followed, paths_in
 from vla_zenoh.profile.schema import DEFAULT_FOLDER, SecurityProfile
 from vla_zenoh.resources import is_path, shipped
 from vla_zenoh.security.bridge import bridges
-from vla_zenoh.security.certificates import Entry, unused_certificates
+from vla_zenoh.security.certificates import Entry, unfit_certificates
 from vla_zenoh.security.roles import PEOPLE, Role, identities, identities_of, operator_identities
 from vla_zenoh.security.store import Store
 from vla_zenoh_secure.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
@@ -274,7 +274,7 @@ def add(
         with output_file(profile_file(profile), force=True) as part:
             part.write_text(new, "utf-8")
         loaded = load_profile(profile)
-    for path, why in unused_certificates(loaded, store.entries(now_utc(), host)).items():
+    for path, why in unfit_certificates(loaded, store.entries(now_utc(), host)).items():
         warn(f"{path} {why}")
     here, file = store.known_host(), profile_file(profile)
     routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
@@ -324,7 +324,7 @@ def show(
     store, now = _store(folder, security), now_utc()
     entries, robots = store.entries(now), store.names().robots
     if security is not None and folder is None:
-        why = unused_certificates(loaded, entries)
+        why = unfit_certificates(loaded, entries)
         entries = [
             entry if entry.faults else replace(entry, warning=why.get(entry.path, entry.warning))
             for entry in entries

@@ -9,7 +9,8 @@ from typing import Any
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.profile import HostProfile, Profile
 from vla_zenoh.profile.load import write_yaml
-from vla_zenoh.profile.schema import ANYWHERE, address_of, host_of, is_loopback
+from vla_zenoh.profile.schema import address_of, is_loopback
+from vla_zenoh.security.certificates import router_names
 from vla_zenoh.security.roles import Role
 
 HEAD = """\
@@ -52,13 +53,8 @@ def moved_hosts(profile: Profile, at: Mapping[str, str]) -> dict[str, str]:
 
 
 def serving_addresses(profile: Profile, more: Iterable[str] = ()) -> list[str]:
-    """Names and addresses at which clients look for the routers of a profile."""
-    session = profile.session
-    endpoints = [*session.connect, *session.listen]
-    for host in profile.hosts.values():
-        endpoints += [*(host.connect or ()), *(host.listen or ()), *(host.link or ())]
-    named = [host_of(e) for e in endpoints if not address_of(e).startswith(ANYWHERE)]
-    return [name for name in dict.fromkeys([*named, "127.0.0.1", "localhost", *more]) if name]
+    """Names and addresses for the certificates of a profile's routers."""
+    return list(dict.fromkeys([*router_names(profile), "127.0.0.1", "localhost", *more]))
 
 
 def profile_text(

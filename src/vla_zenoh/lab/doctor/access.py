@@ -30,7 +30,7 @@ def access(profile: Profile) -> Iterator[HostFinding]:
         yield _without(profile)
         return
     try:
-        from vla_zenoh.security.certificates import CheckedStore, unused_certificates
+        from vla_zenoh.security.certificates import CheckedStore, unfit_certificates
 
         store = CheckedStore(security.folder)
         host = store.this_host(security.host)
@@ -39,7 +39,7 @@ def access(profile: Profile) -> Iterator[HostFinding]:
         yield HostFinding("certificates", "fail", str(error))
         return
     yield certificates(host, entries)
-    for path, why in unused_certificates(profile, entries).items():
+    for path, why in unfit_certificates(profile, entries).items():
         yield HostFinding(f"certificate {path.name}", "warn", why)
     for entry in entries:
         if entry.node not in SERVERS and not entry.faults:
