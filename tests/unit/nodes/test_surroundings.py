@@ -36,7 +36,7 @@ class Scene:
         self.command, self.camera, self.thief = command, camera, thief
         self.ears = PeerMonitor(command)
         self.peers = PeerSnapshot()
-        self.nodes = (command, camera, thief)
+        self.nodes: tuple[Node, ...] = (command, camera, thief)
         for node in (camera, thief):
             await_match(node.session, node.keys.status(node.name))
         until("both are alive", lambda: {camera.name, thief.name} <= self.look().alive)
@@ -102,6 +102,15 @@ def test_a_camera_is_believed_by_the_node_that_serves_it_and_by_no_other(scene: 
     scene.says(scene.thief, -1e9)
     assert scene.look().camera_nodes == {"front": "camera"}
     assert scene.peers.camera_ages_s["front"] >= 3.0
+
+
+def test_of_a_camera_node_that_is_gone_no_image_is_known(scene: Scene) -> None:
+    scene.says(scene.camera, 0.0)
+    until("its word", lambda: scene.look().camera_ages_s)
+    scene.nodes = (scene.command, scene.thief)
+    scene.camera.close()
+    until("it is gone", lambda: scene.camera.name not in scene.look().alive)
+    assert scene.peers.camera_ages_s == {}
 
 
 def test_what_is_wrong_with_a_camera_is_its_own_nodes_word_until_it_is_good(scene: Scene) -> None:

@@ -253,6 +253,9 @@ class PeerMonitor:
         for known in (self._status_sources, self._hosts):
             known.pop(name, None)
         self._same_host.discard(name)
+        for camera in [camera for camera, node in self._servers.items() if node == name]:
+            for known in (self._cameras, self._camera_faults, self._camera_reasons):
+                known.pop(camera, None)
         if name.startswith("worker-"):
             for known in (self._specs, self._spec_sources, self._complaints):
                 known.pop(name.removeprefix("worker-"), None)
