@@ -36,14 +36,12 @@ from vla_zenoh.profile import Profile, as_robot, load_profile, override
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState, Task
 
-pytestmark = pytest.mark.long
-
 ROBOTS = ("a", "b", "c")
 STATE_HZ = 50.0
 RATE_HZ = 10.0
 SLOW_S = 0.12
 """One inference of a slow model: longer than a request's period, so that requests meet."""
-SLOWER_S, BEHIND_S, OLDEST_S = 0.3, 0.45, 0.6
+SLOWER_S, BEHIND_S, OLDEST_S = 0.15, 0.45, 0.55
 """An inference, and the age of what a robot sends, which together are more than is obeyed."""
 IN_A_BATCH_S, OLDEST_OF_A_BATCH_S = 0.25, 0.6
 """What each robot adds to an inference, so that one for three robots is too late for all."""
@@ -184,6 +182,7 @@ def served(
             assert not any(thread.is_alive() for thread in threads)
 
 
+@pytest.mark.long
 def test_robots_that_are_ready_at_once_are_answered_in_one_batch(
     profile: Profile, router: None
 ) -> None:
@@ -204,6 +203,7 @@ def test_robots_that_are_ready_at_once_are_answered_in_one_batch(
     assert set(ROBOTS) <= set(model.resets)
 
 
+@pytest.mark.long
 def test_a_robot_that_falls_silent_or_fails_holds_up_no_other(
     profile: Profile, router: None
 ) -> None:
@@ -265,6 +265,7 @@ def test_a_chunk_that_would_come_too_late_is_computed_when_it_keeps_no_other_rob
             assert status.detail["complaint"].startswith("too_late")
 
 
+@pytest.mark.long
 def test_where_a_batch_of_all_is_too_late_for_all_they_are_answered_in_smaller_ones(
     profile: Profile, router: None
 ) -> None:
@@ -286,6 +287,7 @@ def test_where_a_batch_of_all_is_too_late_for_all_they_are_answered_in_smaller_o
         assert len(model.batches[-1]) < len(ROBOTS)
 
 
+@pytest.mark.long
 def test_each_robot_has_its_own_rate(profile: Profile, router: None) -> None:
     with served(profile, Together()) as robots:
         a, b, c = robots.values()
@@ -300,6 +302,7 @@ def test_each_robot_has_its_own_rate(profile: Profile, router: None) -> None:
         assert fast > middle > slow
 
 
+@pytest.mark.long
 def test_a_model_that_cannot_batch_is_there_once_for_each_robot(
     profile: Profile, router: None
 ) -> None:
@@ -323,6 +326,7 @@ def test_a_model_that_cannot_batch_is_there_once_for_each_robot(
         assert axes == {"a": 2, "b": 2, "c": 5}
 
 
+@pytest.mark.long
 def test_up_starts_a_worker_for_all_robots_that_the_profile_names() -> None:
     endpoint = free_endpoint()
     changes = {
@@ -355,6 +359,7 @@ def test_up_starts_a_worker_for_all_robots_that_the_profile_names() -> None:
     assert moving == [2, 3, 4]
 
 
+@pytest.mark.long
 def test_a_model_that_cannot_say_whose_episode_begins_is_refused(
     profile: Profile, router: None
 ) -> None:

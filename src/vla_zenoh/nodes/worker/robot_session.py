@@ -250,7 +250,9 @@ class RobotSession:
         except Exception as error:
             self.failed(error)
             return None
-        self.complaint = self._failure = ""
+        if self.complaint == self._failure:  # else it comes too late, as is said
+            self.complaint = ""
+        self._failure = ""
         _, start_ns, end_ns = times_ns
         patience_s = self.node.profile.timing.max_observation_age_s
         chunk = make_chunk(
