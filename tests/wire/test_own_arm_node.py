@@ -195,15 +195,6 @@ def test_an_arm_that_waits_in_move_is_told_so_and_stands(lab: Lab) -> None:
     assert any("my_arm" in e.why or "own_arm.py" in e.why for e in chain.events("running->stalled"))
 
 
-def test_a_command_node_that_is_killed_leaves_an_arm_that_brakes(lab: Lab) -> None:
-    chain = lab.chain
-    chain.move()
-    since_ns = newest_ns(lab)
-    os.kill(chain.pid("command"), signal.SIGKILL)
-    lab.brakes(since_ns)
-    chain.until("the command node is back", lambda: chain.state() == "inactive", AGAIN_S)
-
-
 @pytest.mark.slow
 def test_an_arm_that_takes_long_to_connect_is_not_taken_for_one_that_hangs(lab: Lab) -> None:
     chain = lab.chain
