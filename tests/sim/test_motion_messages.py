@@ -59,6 +59,7 @@ def settled_height_m(loop: Lockstep) -> float:
     return float(path_m(loop)[-1, 2])
 
 
+@pytest.mark.long
 def test_late_chunks_cost_time_and_no_way() -> None:
     loop = moving(0.6)
     start_m, steps = path_m(loop)[0, 2], loop.commander.progress.steps
@@ -71,6 +72,7 @@ def test_late_chunks_cost_time_and_no_way() -> None:
     check_motion(loop)
 
 
+@pytest.mark.long
 def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm() -> None:
     first: dict[str, Message] = {}
 
@@ -98,6 +100,7 @@ def test_duplicates_at_once_and_much_later_move_nothing() -> None:
     np.testing.assert_array_equal(after(AFTER_S, again), undisturbed(AFTER_S))
 
 
+@pytest.mark.long
 def test_a_chunk_that_is_overtaken_is_left_out_and_nothing_jumps() -> None:
     loop = moving(0.6)
     start_m = path_m(loop)[0, 2]
@@ -113,6 +116,7 @@ def test_a_chunk_that_is_overtaken_is_left_out_and_nothing_jumps() -> None:
     check_motion(loop)
 
 
+@pytest.mark.long
 def test_commands_in_disorder_do_not_shake_the_arm() -> None:
     mixed = after(
         AFTER_S,
@@ -123,6 +127,7 @@ def test_commands_in_disorder_do_not_shake_the_arm() -> None:
     assert np.abs(mixed - undisturbed(AFTER_S)).max() < EXACT_M
 
 
+@pytest.mark.long
 def test_a_heap_of_chunks_after_a_pause_is_not_made_up_for() -> None:
     loop = moving(steps=1)
     since = mark(loop)
@@ -150,6 +155,7 @@ def test_a_second_worker_moves_nothing_while_the_first_has_the_arm() -> None:
     np.testing.assert_array_equal(path_m(loop), undisturbed(AFTER_S))
 
 
+@pytest.mark.long
 def test_a_second_process_under_the_name_of_the_worker_moves_nothing() -> None:
     def forge(sent: Message) -> Iterable[Message]:
         header = replace(sent.header, source="worker-scripted-2", seq=sent.header.seq + 100)

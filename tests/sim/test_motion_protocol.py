@@ -22,7 +22,7 @@ PATIENCE_S = 60.0
 @pytest.mark.parametrize(
     ("prompt", "conditions"),
     [
-        ("close gripper", Conditions(10.0)),
+        ("close gripper", Conditions(25.0)),
         pytest.param("go up", Conditions(5.0, 8, **SLOW_MODEL), marks=pytest.mark.slow),
         pytest.param("yaw right", Conditions(1.0, 50, **SLOW_MODEL), marks=pytest.mark.slow),
         pytest.param("roll left", Conditions(2.0), marks=pytest.mark.slow),

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+import pytest
 from arm_rig import (
     SPEED_M_S,
     STILL_M_S,
@@ -140,6 +141,7 @@ def test_a_goal_out_of_reach_is_approached_and_no_further() -> None:
     check_motion(loop, singular=True)
 
 
+@pytest.mark.long
 def test_a_step_no_arm_can_make_is_not_begun() -> None:
     loop = moving()
     since = mark(loop)
