@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import sys
 import tomllib
 from collections.abc import Generator, Iterator, Mapping
@@ -34,6 +35,7 @@ KILLS = "fault"
 LEFT_OUT = {**dict.fromkeys(IN_REAL_TIME, "realtime"), "franka": "franka", "models": "models"}
 """Folder -> mark of everything in it."""
 
+MARKS_OF_A_FILE = re.compile(r"^pytestmark = (\[[^\]]*|.*)", re.M)
 ROOT = Path(__file__).parent
 RUBBISH = 10_000
 """Objects between two searches for rubbish: with Python's 700 they take 3 of 100 seconds."""
@@ -53,9 +55,13 @@ def pytest_configure() -> None:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Do not even import what -m leaves out: that takes as long as many tests."""
     chosen = config.option.markexpr
-    if chosen.endswith("and realtime") and collection_path.suffix == ".py":
+    if collection_path.suffix == ".py":
+        text = collection_path.read_text("utf-8")
+        said = " ".join(MARKS_OF_A_FILE.findall(text))
+        if any(f"not {mark} " in f"{chosen} " for mark in re.findall(r"mark\.(\w+)", said)):
+            return True
         folders = IN_REAL_TIME.intersection(collection_path.relative_to(ROOT).parts)
-        if not folders and "realtime" not in collection_path.read_text("utf-8"):
+        if chosen.endswith("and realtime") and not folders and "realtime" not in text:
             return True
     mark = LEFT_OUT.get(collection_path.name)
     within = collection_path.parent.name in ("tests", "reliability")
