@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from typing import Any
 
 import pytest
-from camera_rig import free_endpoint
 from chain import COMMAND_HZ, LONG_PATIENCE_S, STATE_HZ, Chain, command_line
 from typed import Typed, typed
 
-from vla_zenoh.bus.session import open_session
-from vla_zenoh.profile import load_profile, override
 from vla_zenoh.simulation.pace import control_steps
 
 ROBOT_PATIENCE_S = LONG_PATIENCE_S
@@ -158,22 +153,6 @@ def test_echo_of_a_silent_key_fails(person: Person) -> None:
     done = person.run("echo", "no/such/key", "--seconds", "0.3")
     assert done.code == REFUSED
     assert "nothing was published on vla/panda/no/such/key" in done.stderr
-
-
-def test_echo_names_the_key_that_was_meant_and_ends_with_the_router() -> None:
-    endpoint = free_endpoint()
-    profile = override(load_profile("panda_sim"), {"session": {"listen": [endpoint]}})
-    words = ("echo", "state/joints", "--count", "1", "--connect", endpoint)
-    with open_session(profile.session, mode="router"):
-        echo = subprocess.Popen(
-            [sys.executable, "-m", "vla_zenoh", *words], stderr=subprocess.PIPE, text=True
-        )
-        assert echo.stderr is not None
-        hint = echo.stderr.readline()
-    _, said = echo.communicate(timeout=30.0)
-    assert hint == "nothing on vla/panda/state/joints yet; did you mean 'state/joint'?\n"
-    assert f"error: no Zenoh router answers at {endpoint}" in said
-    assert echo.returncode == REFUSED
 
 
 def test_without_a_router_a_command_says_where_it_looked_and_what_to_do(person: Person) -> None:

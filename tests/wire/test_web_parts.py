@@ -24,14 +24,14 @@ HIGH_M = 0.5
 PROFILE = """\
 extends: two_pandas_sim
 cameras:
-  front: {{source: "sim:front", width: 160, height: 120, rate_hz: 10}}
-  top: {{source: "sim:top", width: 160, height: 120, rate_hz: 10}}
+  top: {{source: "sim:top", width: 160, height: 120, rate_hz: 5}}
+  front: null
   left_wrist: null
   right_wrist: null
 session:
   listen: [{endpoint}]
   connect: [{endpoint}]
-timing: {{command_timeout_s: 0.5, state_timeout_s: 0.5, command_hz: 100, state_hz: 100}}
+timing: {{command_timeout_s: 0.5, state_timeout_s: 0.5, command_hz: 50, state_hz: 50}}
 """
 
 
