@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from vla_zenoh.errors import NodeError, RecordError, ResourceError
 from vla_zenoh.kinematics.fingers import Fingers
-from vla_zenoh.kinematics.so3 import quat_from_rotation, rotation_from_rpy
+from vla_zenoh.kinematics.so3 import cross3, quat_from_rotation, rotation_from_rpy
 from vla_zenoh.policy.meaning import reference as as_reference
 from vla_zenoh.policy.meaning import toward
 from vla_zenoh.profile import GripperProfile, Profile
@@ -404,7 +404,7 @@ class SimulatedPart:
             force, moment = sign * (local[:3] @ axes), sign * (local[3:] @ axes)
             lever = contact.pos - self._world_m
             total[:3] += force
-            total[3:] += moment + np.cross(lever, force)
+            total[3:] += moment + cross3(lever, force)
         return self._axes_of_base(total)
 
     # -- measurements -------------------------------------------------------------------------
@@ -569,11 +569,11 @@ class SimulatedGripper:
     def _opening(self) -> tuple[float, float]:
         if not self._q:
             return self._set_m, 0.0
-        q, v = (
-            sum(share * at.item() for share, at in zip(self._shares, joints, strict=True))
-            for joints in (self._q, self._v)
-        )
-        return q + self._shut_m, v
+        width_m, rate_m_s = self._shut_m, 0.0
+        for share, at, rate in zip(self._shares, self._q, self._v, strict=True):
+            width_m += share * at.item()
+            rate_m_s += share * rate.item()
+        return width_m, rate_m_s
 
     def _bound_force(self, force_n: float) -> None:
         limit_n = min(force_n, MAX_FORCE_N)

@@ -118,7 +118,8 @@ class Form:
             [(field.name, wires[field.name].form, _default(field)) for field in fields],
             namespace={"__doc__": kind.__doc__},
         )
-        self._makers = [(name, wire.make) for name, wire in wires.items()]
+        self._plain = [name for name, wire in wires.items() if wire.make is as_read]
+        self._makers = [(n, wire.make) for n, wire in wires.items() if wire.make is not as_read]
         self._decoder = msgpack.Decoder(self.struct)
 
     def read(self, payload: bytes) -> Any:
@@ -139,6 +140,8 @@ class Form:
 
     def settle(self, record: Any, found: Any) -> None:
         """Put fields into a record in their final form."""
+        for name in self._plain:
+            object.__setattr__(record, name, getattr(found, name))
         for name, make in self._makers:
             object.__setattr__(record, name, make(name, getattr(found, name)))
         record._check()
@@ -215,6 +218,8 @@ def _wire(hint: Any) -> Wire:
     """Wire form of a field, and how its value is made."""
     if type(None) in get_args(hint):
         inner = _wire(get_args(hint)[0])
+        if inner.make is as_read:
+            return Wire(inner.form | None, as_read)
         return Wire(inner.form | None, lambda name, v: None if v is None else inner.make(name, v))
     part = _part(hint)
     if part is not None:
