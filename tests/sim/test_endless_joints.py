@@ -24,7 +24,7 @@ STEP_S, HORIZON = 0.1, 8
 SPEED_RAD_S = 1.2
 QUICK = {
     "task": {"rate_hz": 5},
-    "timing": {"command_hz": 100, "state_hz": 100},
+    "timing": {"command_hz": 50, "state_hz": 50},
     "limits": {
         "joint": {"velocity_rad_s": [2.0] * 6},
         "rotation": {"velocity_rad_s": 2.5},
@@ -112,7 +112,7 @@ def test_turns_of_the_wrist_are_made_without_a_jump(
     assert way_rad == pytest.approx(count * TURN, abs=5e-3)
     ways = np.diff([command.position_rad for command in joint_commands(loop)], axis=0)
     assert ways[:, 5].min() > -1e-5
-    assert np.abs(ways).max() < 2.0 * 1.001 / 100
+    assert np.abs(ways).max() < 2.0 * 1.001 / 50
     assert np.abs(ways[:, :5]).max() < 1e-4
     told = np.array(model.told)
     if turns == "wrapped":

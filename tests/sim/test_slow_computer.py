@@ -73,7 +73,7 @@ def largest_lag_m(world: World, slowness: float, pauses_ns: dict[int, int]) -> f
     return worst_m
 
 
-@pytest.mark.parametrize("slowness", [0.5, 1.3, 1.8, 2.5])
+@pytest.mark.parametrize("slowness", [1.3, 2.5])
 def test_an_arm_stays_on_its_command_where_the_world_is_slower_than_real_time(
     slowness: float,
 ) -> None:

@@ -42,7 +42,7 @@ QUATERNION_TOLERANCE = 1e-15
 DECODES = 10
 MAX_SENTENCE = 8000  # characters of an error message
 KINDS = sorted(RECORDS, key=lambda kind: kind.__name__)
-NOTHING_TAKEN = settings(max_examples=20, suppress_health_check=[HealthCheck.too_slow])
+NOTHING_TAKEN = settings(max_examples=12, suppress_health_check=[HealthCheck.too_slow])
 
 by_kind = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 

@@ -19,7 +19,7 @@ from vla_zenoh.policy.meaning import wrapped
 HOME = np.array(HOME_RAD)
 TURN = 2 * math.pi
 EXACT = 1e-5
-SELDOM = {"command_hz": 100}
+SELDOM = {"command_hz": 50}
 FLANGE = np.array([0, 0, 0, 0, 0, 1.0])
 
 
@@ -65,7 +65,7 @@ def test_deltas_add_up_over_many_turns(folder: Path) -> None:
 
 
 def test_a_far_target_is_approached_on_the_shortest_way(folder: Path) -> None:
-    arm = Joints(endless_arm(folder))
+    arm = Joints(endless_arm(folder, timing=SELDOM))
     arm.at(HOME + 5 * TURN * FLANGE)
     arm.activate()
     arm.settle(HOME + (0.6 - TURN) * FLANGE, 3.0)
@@ -73,7 +73,7 @@ def test_a_far_target_is_approached_on_the_shortest_way(folder: Path) -> None:
 
 
 def test_a_way_that_is_told_from_the_start_of_a_chunk_is_the_shortest_too(folder: Path) -> None:
-    arm = Joints(endless_arm(folder), kind="delta", relative_to="start")
+    arm = Joints(endless_arm(folder, timing=SELDOM), kind="delta", relative_to="start")
     arm.activate()
     # As of a model that subtracts wrapped positions from each other.
     arm.send(*[list((0.05 * n - TURN) * FLANGE) for n in range(1, 9)])
@@ -83,7 +83,7 @@ def test_a_way_that_is_told_from_the_start_of_a_chunk_is_the_shortest_too(folder
 
 
 def test_home_is_at_the_end_of_the_shortest_way(folder: Path) -> None:
-    arm = Joints(endless_arm(folder))
+    arm = Joints(endless_arm(folder, timing=SELDOM))
     arm.at(HOME + (4 * TURN + 0.3) * FLANGE)
     arm.activate()
     arm.settle(HOME, 3.0)
@@ -91,7 +91,7 @@ def test_home_is_at_the_end_of_the_shortest_way(folder: Path) -> None:
 
 
 def test_degrees_are_still_recognised(folder: Path) -> None:
-    arm = Joints(endless_arm(folder))
+    arm = Joints(endless_arm(folder, timing=SELDOM))
     arm.activate()
     arm.send(np.rad2deg(HOME))
     arm.run(0.5)
@@ -100,7 +100,9 @@ def test_degrees_are_still_recognised(folder: Path) -> None:
 
 
 def test_a_pose_is_turned_to_past_half_a_turn(folder: Path) -> None:
-    arm = Joints(endless_arm(folder), space="tcp", joints=(), kind="delta", rotation="rotvec")
+    arm = Joints(
+        endless_arm(folder, timing=SELDOM), space="tcp", joints=(), kind="delta", rotation="rotvec"
+    )
     reach_of(arm.profile)
     arm.rig.tick(chunks=[arm.rig.chunk([[0.0] * 6])])
     arm.tick(Setting("active", True))
@@ -116,7 +118,7 @@ def test_a_pose_is_turned_to_past_half_a_turn(folder: Path) -> None:
 
 
 def test_a_robot_that_begins_to_count_anew_is_not_turned_back(folder: Path) -> None:
-    arm = Joints(endless_arm(folder))
+    arm = Joints(endless_arm(folder, timing=SELDOM))
     arm.at(HOME + 3 * TURN * FLANGE)
     arm.activate()
     arm.settle(HOME, 0.8)
@@ -135,7 +137,7 @@ def test_a_robot_that_begins_to_count_anew_is_not_turned_back(folder: Path) -> N
 
 
 def test_a_count_that_begins_anew_under_an_active_arm_ends_the_activation(folder: Path) -> None:
-    arm = Joints(endless_arm(folder))
+    arm = Joints(endless_arm(folder, timing=SELDOM))
     arm.at(HOME + 3 * TURN * FLANGE)
     arm.activate()
     arm.settle(HOME, 0.8)

@@ -347,7 +347,7 @@ def test_an_elbow_on_its_way_to_its_posture_does_not_put_off_the_watchdog(postur
 
 
 def test_an_arm_whose_elbow_creeps_to_its_posture_is_at_rest_within_seconds() -> None:
-    changes = {"robot": {"command": "joint", "posture": "home"}, "timing": {"command_hz": 100}}
+    changes = {"robot": {"command": "joint", "posture": "home"}, "timing": {"command_hz": 50}}
     arm = Arm(override(load_profile("panda_sim"), changes))
     arm.at_rad = arm.at_rad + np.array([0.3, 0.0, -0.3, 0.0, 0.3, 0.0, 0.0])
     arm.stand_at(arm.reach.kinematics, arm.at_rad)

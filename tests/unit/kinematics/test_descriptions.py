@@ -217,7 +217,9 @@ REFUSED: dict[str, Refused] = {
         urdf([*arm(SIX, j2=Row("j2", axis=Y, velocity=0.002)), TOOL]), ("0.002 rad/s", "'j2'")
     ),
     "an arm of a thousandth": Refused(
-        urdf([row._replace(at_m=(0.0, 0.0, 0.0002)) for row in [*arm(SIX), TOOL]]),
+        urdf([row._replace(at_m=(0.0, 0.0, 0.0002)) for row in [*arm(SIX), TOOL]]).replace(
+            BALL, '<sphere radius="0.00008"/>'
+        ),
         ("m long from its first joint to the TCP", "divided by 1000"),
     ),
     "millimetres": Refused(urdf([*MILLIMETRES, TOOL]), ("200 m", "millimetres")),

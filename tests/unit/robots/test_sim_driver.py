@@ -205,7 +205,7 @@ def test_every_arm_brakes_by_itself_when_a_stop_is_put(name: str, mode: str) -> 
         node = RobotNode(SimDriver(load_profile(name), lockstep=True), session)
         writers = [StreamWriter(arm, mode) for arm in node.arms.values()]
         fastest_rad_s = 0.0
-        for step in range(1, 1000):
+        for step in range(1, 800):
             if step % 4 == 0:
                 for writer in writers:
                     session.put(*writer.command(step), attachment=writer.header(step))
