@@ -11,17 +11,10 @@ from pathlib import Path
 
 import pytest
 from camera_rig import free_endpoint, until
-from chain import (
-    COMMAND_HZ,
-    LONG_PATIENCE_S,
-    READY_PATIENCE_S,
-    STATE_HZ,
-    Chain,
-    command_line,
-)
+from chain import COMMAND_HZ, LONG_PATIENCE_S, READY_PATIENCE_S, STATE_HZ, Chain
+from typed import typed
 
 from vla_zenoh.bus.session import alive_nodes, open_session
-from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import Profile, load_profile
 
 CLIENTS = Path(__file__).parents[1] / "examples" / "wire"
@@ -111,28 +104,20 @@ def moves_exactly_stops_and_is_reset(chain: Chain) -> None:
 @contextmanager
 def alone(profile_file: Path, *words: str) -> Iterator[None]:
     """A router and a client, and nothing else."""
-    router = [sys.executable, "-m", "vla_zenoh", "node", "router", "--profile", str(profile_file)]
-    with subprocess.Popen(router, stdout=subprocess.DEVNULL) as first:
+    session = load_profile(str(profile_file)).session
+    with (
+        open_session(session, mode="router"),
+        subprocess.Popen(words, stdout=subprocess.DEVNULL) as process,
+    ):
         try:
-            until("the router listens", lambda: _listens(profile_file), READY_PATIENCE_S)
-            with subprocess.Popen(words, stdout=subprocess.DEVNULL) as process:
-                try:
-                    yield
-                finally:
-                    process.terminate()
+            yield
         finally:
-            first.terminate()
+            process.terminate()
 
 
-def _listens(profile_file: Path) -> bool:
-    try:
-        open_session(load_profile(str(profile_file)).session).close()
-    except SessionError:
-        return False
-    return True
-
-
-def conform(profile_file: Path, node: str, *words: str) -> tuple[int, dict[str, bool | None], str]:
+def conform(
+    capsys: pytest.CaptureFixture[str], profile_file: Path, node: str, *words: str
+) -> tuple[int, dict[str, bool | None], str]:
     """Exit status, rules, and what was told by `vla-zenoh conform` of a node, once it is there."""
 
     def there() -> bool:
@@ -141,7 +126,7 @@ def conform(profile_file: Path, node: str, *words: str) -> tuple[int, dict[str, 
             return node in alive_nodes(session, profile.keys, node)
 
     until(f"{node} is there", there, READY_PATIENCE_S)
-    done = command_line("conform", *words, "--json", "--profile", str(profile_file))
+    done = typed(capsys, "conform", *words, "--json", "--profile", str(profile_file))
     assert done.stdout, done.stderr
     found = {each["rule"]: each["right"] for each in json.loads(done.stdout)}
-    return done.returncode, found, done.stdout + done.stderr
+    return done.code, found, done.stdout + done.stderr

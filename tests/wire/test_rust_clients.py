@@ -130,17 +130,21 @@ def test_the_rust_robot_does_a_motion_of_the_bench_exactly(chain: Chain, case: M
     assert found.steps_done == STEPS
 
 
-def test_conform_finds_nothing_wrong_with_the_rust_robot(tmp_path: Path) -> None:
+def test_conform_finds_nothing_wrong_with_the_rust_robot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = profile_of(tmp_path, str(CLIENTS / "robot.yaml"))
     profile = load_profile(str(path))
     with alone(path, *robot_of(profile)):
-        status, found, told = conform(path, profile.robot.node, "robot", "--move")
+        status, found, told = conform(capsys, path, profile.robot.node, "robot", "--move")
     assert set(rules.TRIALS) <= set(found), told
     assert not {rule for rule, right in found.items() if right is False}, told
     assert status == 0
 
 
-def test_the_rust_worker_draws_circles_with_the_rust_robot_and_conforms(tmp_path: Path) -> None:
+def test_the_rust_worker_draws_circles_with_the_rust_robot_and_conforms(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     more = "workers: [circles]\ntask: {prompt: hold, rate_hz: 10, worker: circles}\n"
     more += "options: {scripted: null}\nhosts: {here: {nodes: [router, command]}}\n"
     path = profile_of(tmp_path, str(CLIENTS / "robot.yaml"), more)
@@ -153,7 +157,7 @@ def test_the_rust_worker_draws_circles_with_the_rust_robot_and_conforms(tmp_path
         chain.activate_when_ready()
         chain.client.set_prompt("circle")
         chain.until("it moves", chain.moves)
-        status, found, told = conform(path, "worker-circles", "worker", "circles")
+        status, found, told = conform(capsys, path, "worker-circles", "worker", "circles")
         assert not {rule for rule, right in found.items() if right is False}, told
         assert {"steps as its spec says", "spec_hash", "episode"} <= set(found), told
         assert status == 0

@@ -91,7 +91,9 @@ OUR_ROBOT = [sys.executable, "-m", "vla_zenoh", "node", "sim"]
 
 @pytest.mark.long
 @pytest.mark.parametrize("which", ["ours", "plain", "wrong"])
-def test_conform_tells_a_right_robot_from_a_wrong_one(tmp_path: Path, which: str) -> None:
+def test_conform_tells_a_right_robot_from_a_wrong_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], which: str
+) -> None:
     extends = "panda_sim" if which == "ours" else str(CLIENTS / "robot.yaml")
     path = profile_of(tmp_path, extends)
     profile = load_profile(str(path))
@@ -101,7 +103,7 @@ def test_conform_tells_a_right_robot_from_a_wrong_one(tmp_path: Path, which: str
     elif which == "wrong":
         words = in_python(profile, "robot.py", before=WRONG_ROBOT)
     with alone(path, *words):
-        status, found, told = conform(path, profile.robot.node, "robot", "--move")
+        status, found, told = conform(capsys, path, profile.robot.node, "robot", "--move")
     wrong = {rule for rule, right in found.items() if right is False}
     assert set(rules.TRIALS) <= set(found), told
     if which == "wrong":
@@ -114,7 +116,9 @@ def test_conform_tells_a_right_robot_from_a_wrong_one(tmp_path: Path, which: str
         assert status == 0
 
 
-def test_conform_finds_nothing_wrong_with_the_worker_in_plain_python(tmp_path: Path) -> None:
+def test_conform_finds_nothing_wrong_with_the_worker_in_plain_python(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     more = (
         "cameras: {front: null, wrist: null}\n"
         "workers: [plain]\n"
@@ -124,7 +128,7 @@ def test_conform_finds_nothing_wrong_with_the_worker_in_plain_python(tmp_path: P
     path = profile_of(tmp_path, "panda_bricks", more)
     words = in_python(load_profile(str(path)), "worker.py")
     with running_chain(tmp_path, profile_file=path), running(words):
-        status, found, told = conform(path, "worker-plain", "worker", "plain")
+        status, found, told = conform(capsys, path, "worker-plain", "worker", "plain")
     assert not {rule for rule, right in found.items() if right is False}, told
     assert {"steps as its spec says", "spec_hash", "episode", "times in order"} <= set(found), told
     assert status == 0
@@ -141,14 +145,16 @@ CAMERA_HZ = 10
 
 
 @pytest.mark.parametrize("which", ["plain", "frozen"])
-def test_conform_tells_a_right_camera_from_a_frozen_one(tmp_path: Path, which: str) -> None:
+def test_conform_tells_a_right_camera_from_a_frozen_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], which: str
+) -> None:
     more = f"cameras: {{front: {{rate_hz: {CAMERA_HZ}}}, wrist: null}}\n"
     path = profile_of(tmp_path, "panda_sim", more)
     before = FROZEN_CAMERA if which == "frozen" else ""
     profile = load_profile(str(path))
     words = in_python(profile, "camera.py", "front", str(CAMERA_HZ), before=before)
     with alone(path, *words):
-        status, found, told = conform(path, "camera", "camera", "front")
+        status, found, told = conform(capsys, path, "camera", "camera", "front")
     wrong = {rule for rule, right in found.items() if right is False}
     streams = {f"camera/front/{kind}: images change" for kind in ("raw", "jpeg")}
     assert wrong == (streams if which == "frozen" else set()), told
