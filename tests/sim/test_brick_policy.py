@@ -92,7 +92,11 @@ def carry_out(stage: Stage, episode: TaskEpisode, limit_s: float = LIMIT_S) -> V
     """Reset, ask, and look on until it is decided."""
     stage.world.reset(episode.seed)
     loop = Lockstep(
-        load_profile(PROFILE), stage.world, make_policy(find_model("brick")), picture=stage.picture
+        load_profile(PROFILE),
+        stage.world,
+        make_policy(find_model("brick")),
+        picture=stage.picture,
+        steps=2,
     )
     loop.put("prompt", episode.prompt)
     loop.run(0.6)

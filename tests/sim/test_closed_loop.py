@@ -24,6 +24,7 @@ from vla_zenoh.policy import (
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.simulation.impedance import ImpedanceGains
+from vla_zenoh.simulation.pace import MAX_STEPS
 from vla_zenoh.simulation.world import World
 from vla_zenoh.types import PoseReference
 
@@ -95,7 +96,7 @@ def begin(
         world,
         policy or make_policy(find_model("scripted"), options),
         delays=delays,
-        steps=2,
+        steps=MAX_STEPS,
     )
     loop.run(0.2 + 1 / rate_hz)
     loop.put("active", True)
@@ -214,7 +215,7 @@ def test_every_rotation_turns_about_its_own_axis_and_moves_nothing(
 
 
 def test_the_gripper_closes_and_opens() -> None:
-    loop = begin(10.0, make_world())
+    loop = begin(5.0, make_world())
     assert loop.world.gripper_state().width_m == pytest.approx(0.08, abs=WIDTH_M)
     for prompt, count, width_m in (
         ("close gripper", 1, 0.03),

@@ -37,12 +37,13 @@ def new(folder: Path, text: str, *words: str) -> tuple[int, str, Path]:
 
 
 def loop_of(file: Path) -> tuple[Lockstep, World]:
-    # Slow nodes: only where the arm ends up matters.
+    # Slow nodes, at whose rates the simulator computes control every 4 ms: only where the arm
+    # ends up matters.
     slow = override(load_profile(str(file)), {"timing": {"command_hz": 50, "state_hz": 50}})
     world = build_world(slow)
     reach = ReachabilityFilter(slow)
     loop = Lockstep(
-        slow, world, make_policy(find_model("scripted"), profile=str(file)), reach=reach, steps=2
+        slow, world, make_policy(find_model("scripted"), profile=str(file)), reach=reach, steps=4
     )
     return loop, world
 

@@ -14,7 +14,7 @@ from vla_zenoh.profile import load_profile
 HORIZON, DT_S, RATE_HZ = 8, 0.1, 2.5
 STEP_M = 0.006
 LATE = Delays(inference_s=0.25, camera_s=0.02)
-RUN_S = 3.0
+RUN_S = 2.0
 ONE_STEP_M = 1.05 * STEP_M
 """What the goal moves by within a chunk, and rounding."""
 
@@ -51,7 +51,7 @@ def jumps_m(*, takes_committed: bool) -> np.ndarray:
         make_world(),
         Wavering(takes_committed=takes_committed),
         delays=LATE,
-        steps=2,
+        steps=4,
     )
     loop.put("rate", RATE_HZ)
     loop.put("prompt", "pass")

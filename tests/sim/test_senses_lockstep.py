@@ -45,7 +45,7 @@ class Looker:
 
 def watch(model: Looker, seconds: float) -> Lockstep:
     profile = override(load_profile("panda_sim"), {"cameras": {"front": {"depth_unit_m": 0.001}}})
-    loop = Lockstep(profile, build_world(profile), model, delays=Delays(inference_s=0.15), steps=2)
+    loop = Lockstep(profile, build_world(profile), model, delays=Delays(inference_s=0.15), steps=4)
     loop.put("rate", RATE_HZ)
     loop.run(seconds)
     return loop
