@@ -9,10 +9,12 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.world import World
 from vla_zenoh.types import JointReference
 
-JAW_M = 0.022
-"""From the fixed jaw's tip of the SO-101, which is its TCP, to the middle of what it holds."""
+IN_JAW_M = np.array([-0.0146, 0.0, -0.022])
+"""From the fixed jaw's tip of the SO-101, which is its TCP, to the middle of a brick beside it."""
 SLIPPED_M = 0.003
 CLOSE_TICKS = 2400
+TOUCHED_M = 5e-5
+"""Ten times what it falls in a tick."""
 
 
 def hold(world: World, by_m: np.ndarray, profile: Profile) -> np.ndarray:
@@ -20,11 +22,13 @@ def hold(world: World, by_m: np.ndarray, profile: Profile) -> np.ndarray:
     home = JointReference.at_rest(np.array(profile.robot.home_rad))
     still = home if profile.robot.command == "joint" else world.hold_reference()
     world.set_gripper(0.0, 0.1, 25.0)
-    for tick in range(CLOSE_TICKS):
-        if tick < CLOSE_TICKS // 2:
+    touched = False
+    for _ in range(CLOSE_TICKS):
+        if not touched:  # it would be pushed through the fingers
             position_m, rotation = world.tcp()
             world.place(name_of(world), position_m + rotation @ by_m, quat_from_rotation(rotation))
         world.tick(still)
+        touched = touched or np.linalg.norm(brick_m(world) - by_m) > TOUCHED_M
     assert world.gripper_state().holding
     return brick_m(world)
 

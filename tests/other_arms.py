@@ -15,7 +15,7 @@ SO101: dict[str, Any] = {
     "arm_joints": ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"],
     "finger_joints": ["gripper"],
     "home_rad": [0.0, -0.6, 0.6, 0.8, 0.0],
-    "gripper": {"joint_open_rad": 1.7, "joint_shut_rad": 0.0},
+    "gripper": {"joint_open_rad": 1.7, "joint_shut_rad": -0.17},
 }
 UR5: dict[str, Any] = {
     "name": "ur5",

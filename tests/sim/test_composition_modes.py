@@ -56,7 +56,6 @@ def begin(
         policy,
         delays=delays,
         reach=ReachabilityFilter(profile) if bounded else None,
-        steps=2,
     )
     loop.put("rate", rate_hz)
     loop.run(0.5 + 1 / rate_hz)

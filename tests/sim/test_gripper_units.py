@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from brick_rig import JAW_M, held, hold
+from brick_rig import IN_JAW_M, held, hold
 from model_wires import groot, lerobot_server, openpi, openvla_rest, xpolicylab
 from motions import make_world
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
@@ -104,7 +104,7 @@ def test_an_so_101_in_degrees_and_percent_holds_a_brick(
     world = build_world(SO101)
     options = {**SO101_OPTIONS, "gripper_range": ends}
     policy = Keeps(read_field_mapping("so101", {}, "none", options, profile=SO101), number)
-    was_m = hold(world, np.array([-JAW_M, 0.0, 0.0]), SO101)
+    was_m = hold(world, IN_JAW_M, SO101)
     run(SO101, world, policy, seconds)
     held(world, was_m)
     np.testing.assert_allclose(policy.told, number, atol=1e-3)

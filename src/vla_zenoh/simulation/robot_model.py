@@ -111,7 +111,7 @@ SO101 = RobotModel(
     ),
     finger_joints=("gripper",),
     finger_signs=(1.0,),
-    gripper=GripperProfile(max_width_m=0.1, joint_open_rad=1.7, joint_shut_rad=0.0),
+    gripper=GripperProfile(max_width_m=0.1, joint_open_rad=1.7, joint_shut_rad=-0.17),
     finger_links=("gripper_link", "moving_jaw_so101_v1_link"),
     tcp_link="gripper_frame_link",
     camera=MountedCamera(

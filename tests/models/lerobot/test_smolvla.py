@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("lerobot", reason="needs LeRobot's environment: make test-models")
 import tiny_smolvla
-from brick_rig import JAW_M, held, hold
+from brick_rig import IN_JAW_M, held, hold
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 from vla_zenoh_benchmarks.lockstep.worker import Delays
 
@@ -67,7 +67,7 @@ def test_a_tiny_smolvla_with_real_time_chunking_holds_a_brick_for_a_minute(tmp_p
     policy = make_policy(find_model("lerobot"), options)
     policy.load()
     watched, world = Watched(policy), build_world(SO101)
-    was_m = hold(world, np.array([-JAW_M, 0.0, 0.0]), SO101)
+    was_m = hold(world, IN_JAW_M, SO101)
     late = Delays(inference_s=0.15, camera_s=0.02)
     loop = Lockstep(SO101, world, watched, delays=late, reach=ReachabilityFilter(SO101))
     loop.put("rate", 5.0)
