@@ -38,8 +38,8 @@ from vla_zenoh.types import (
 
 HOME = panda().forward(HOME_RAD)
 HOME_QUAT = quat_from_rotation(HOME.rotation)
-TICK_S, RAMP_S = 0.004, 0.24
-TICK_NS = 4_000_000
+TICK_S, RAMP_S = 0.008, 0.24
+TICK_NS = 8_000_000
 SPEED_M_S = 0.2
 TOPIC = "/panda/panda_cartesian_impedance_controller/desired_pose"
 
@@ -130,7 +130,7 @@ class Turns:
 @contextmanager
 def ros2_turns(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = "") -> Iterator[Turns]:
     """`more` is YAML that goes on in the profile's section ros2."""
-    profile = load_profile(str(write_profile(folder, more=more)))
+    profile = load_profile(str(write_profile(folder, more=more, command_hz=125)))
     assert profile.ros2 is not None
     with routed_session() as session:
         goals: list[Any] = []

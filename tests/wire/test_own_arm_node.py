@@ -164,7 +164,8 @@ def test_without_a_state_that_can_be_believed_the_arm_brakes(lab: Lab, what: str
     assert (chain.refused().get("arm.invalid", 0) > 0) == (what == "nan")
 
 
-@pytest.mark.parametrize("what", ["raise", pytest.param("raise once", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["raise", "raise once"])
 def test_an_arm_that_raises_is_braked_and_started_again(lab: Lab, what: str) -> None:
     chain = lab.chain
     chain.move()

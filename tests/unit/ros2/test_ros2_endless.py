@@ -15,7 +15,7 @@ from vla_zenoh import resources
 from vla_zenoh.types import JointCommand, JointState
 
 TURN = 2 * math.pi
-SPEED_RAD_S, RAMP_S = 1.5, 0.5
+SPEED_RAD_S, RAMP_S = 1.2, 0.5
 NEAR_RAD = 0.02
 REPORTED: dict[str, Callable[[float], float]] = {
     "from -pi to pi": lambda at: (at + math.pi) % TURN - math.pi,
