@@ -255,9 +255,7 @@ def test_a_file_that_is_not_there_is_named_without_numbers_of_the_system(
     assert any(word in done.said for word in ("nosuch", "meta/info.json"))
 
 
-@pytest.mark.parametrize(
-    "words", ["up panda_sim", "node command --profile panda_sim", "secure show"]
-)
+@pytest.mark.parametrize("words", ["node command --profile panda_sim", "secure show"])
 def test_a_user_without_a_home_is_told_to_set_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:
