@@ -17,8 +17,10 @@ from dataset_rig import (
     CHUNKS,
     DT_S,
     HEIGHT,
+    LATENCY_MS,
     MIXED,
     PROMPTS,
+    STATE_MS,
     WIDTH,
     depth_counts,
     steps_of,
@@ -73,7 +75,9 @@ def test_pictures_states_and_words_belong_together(folder: Path) -> None:
         picture = item["observation.images.front"]
         assert picture.shape == (3, HEIGHT, WIDTH)
         assert abs(float(picture.mean()) - 2 * (at_ms // 50) / 255) < BRIGHTNESS
-        assert float(item["observation.state"][2]) == pytest.approx(at_ms / 1e4, abs=6e-4)
+        seen_ms = at_ms + (LATENCY_MS if frame < USED else 0)
+        nearest_ms = STATE_MS * round(seen_ms / STATE_MS)
+        assert float(item["observation.state"][2]) == pytest.approx(nearest_ms / 1e4, abs=1e-6)
         assert item["task"] == PROMPTS[episode]
         assert float(item["timestamp"]) == pytest.approx(frame * DT_S)
 

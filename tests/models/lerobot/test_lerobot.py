@@ -25,6 +25,7 @@ from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from safetensors.torch import load_file, save_file
 
 from vla_zenoh.errors import WorkerError
+from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.lab.check.examination import Examination
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.check.model_runner import ModelRunner
@@ -49,7 +50,8 @@ ACTION_OPTIONS = {
     "dt_s": "0.1",
     "state": "position+rotvec+gripper_m",
 }
-STATE = [0.4, 0.1, 0.3, 0.0, 0.0, np.pi / 2, 0.05]
+STATE = [0.4, 0.1, 0.3, 3.0, 0.2, -0.1, 0.05]
+"""Its tool points down, as at home: of another the rotation vector nearest to that is told."""
 
 
 @pytest.fixture(scope="module")
@@ -79,11 +81,11 @@ def looking(policy: Any, seed: int) -> Any:
     shape = (tiny_act.HEIGHT, tiny_act.WIDTH, 3)
     picture = np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
     picture.setflags(write=False)  # as pictures from the bus are
-    half = np.sqrt(0.5)
+    quat_xyzw = quat_from_rotation(exp3(np.array(STATE[3:6])))
     return replace(
         example_observation(policy.spec),
         images={"front": picture},
-        pose=PoseState(np.array(STATE[:3]), np.array([0, 0, half, half]), np.zeros(6)),
+        pose=PoseState(np.array(STATE[:3]), quat_xyzw, np.zeros(6)),
         gripper=GripperState(width_m=STATE[6], moving=False, holding=False),
     )
 
