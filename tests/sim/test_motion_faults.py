@@ -52,6 +52,8 @@ WORKER = "worker-scripted"
 STATES, COMMANDS = (PoseState, GripperState, JointState), (PoseCommand, JointCommand)
 MOVING_S = 1.2
 """Until the speed is steady."""
+LATER_S, FURTHER_M = 0.08, 0.01
+"""What a stop may take more before the speed is steady."""
 NO_ROTATION = {"quat_xyzw": np.array([0.9, 0.0, 0.0, 0.0])}
 
 Happens = Callable[[Lockstep], None]
@@ -170,9 +172,9 @@ def rows() -> Iterator[Any]:
                 yield pytest.param(law, fault, marks=marks)
 
 
-def moving(law: str) -> Lockstep:
+def moving(law: str, seconds: float = MOVING_S) -> Lockstep:
     rig = arm_rig if law == "poses" else joint_arm_rig
-    return rig.moving(MOVING_S)
+    return rig.moving(seconds)
 
 
 def check(law: str, loop: Lockstep, *, own_brake: bool) -> None:
@@ -220,3 +222,26 @@ def test_a_fault_in_motion_stops_the_arm_until_it_is_over(law: str, fault: str) 
         assert way_m(loop, since) < within[1]
         goes_on(loop)
     check(law, loop, own_brake=within in (OWN, SILENT))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("law", ["poses", "joints"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "emergency stop",
+        "chunks lost",
+        "commands lost",
+        "states lost",
+        "clock of the robot +2 s",
+        "a measured pose that jumps by 0.28 m",
+    ],
+)
+def test_an_arm_that_accelerates_or_overshoots_stops_little_later(law: str, fault: str) -> None:
+    happens, (stop_s, stop_m), _, watched_s = FAULTS[fault]
+    for seconds in (0.55, 0.65, 0.75, 0.85, 0.95):
+        loop = moving(law, seconds)
+        since = mark(loop)
+        happens(loop)
+        loop.run(watched_s)
+        check_stop(loop, since, (stop_s + LATER_S, stop_m + FURTHER_M))
