@@ -52,6 +52,7 @@ def test_after_a_stall_it_stands_where_it_sent_the_arm_last_and_says_that_it_is_
         turns.up()
         turns.turn()
         assert turns.newest(GripperState).mode == "stalled"
+    assert turns.refused("pose_stalled") == 30 + STALLED_NS // TICK_NS - 1
     for _ in range(30):
         turns.up()
         turns.turn()
