@@ -29,6 +29,7 @@ def rig_with(*there: str) -> Rig:
 def test_an_arm_in_motion_brakes_when_who_holds_it_is_gone() -> None:
     rig = rig_with(ANNA, BEN)
     rig.put("active", ANNA)
+    assert rig.commander.why.endswith(f"while {ANNA!r} holds it")
     assert rig.state == "active", rig.commander.why
     for _ in range(6):
         rig.send([FORTH])

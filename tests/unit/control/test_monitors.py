@@ -208,6 +208,22 @@ def test_an_arm_does_not_move_to_a_reported_pose_that_its_joints_contradict(
     assert np.linalg.norm(rig.position_m - stood_m) < 1e-3
 
 
+@pytest.mark.parametrize("command", ["pose", "joint"])
+def test_a_pose_that_its_joints_contradict_for_less_than_the_timeout_ends_nothing(
+    command: str,
+) -> None:
+    rig = Arm(command=command)
+    rig.activate()
+    for away_m in (0.03, 0.0, 0.03, 0.0):
+        rig.jump_m = np.array([0.0, away_m, 0.0])
+        rig.run(0.3 * rig.profile.timing.state_timeout_s)
+        assert rig.state == "active", rig.commander.why
+    rig.jump_m = np.array([0.0, 0.03, 0.0])
+    rig.run(2.0 * rig.profile.timing.state_timeout_s)
+    assert rig.state == "inactive"
+    assert "the measured joints put the TCP" in rig.commander.why
+
+
 def test_a_retreat_stops_before_a_bound_as_any_other_motion_does() -> None:
     rig = Arm()
     rig.activate()
