@@ -124,10 +124,12 @@ def test_a_video_plays_at_its_own_rate_and_starts_again(tmp_path: Path) -> None:
         frames, _ = rig.listen(rig.profile.keys.camera_raw("front"))
         until("three rounds", lambda: len(frames) > 24)
         levels = [round(int(frame.rgb[24, 32, 0]) / 20) for frame in frames]
-        steps = set((np.diff(levels) % 8).tolist())
-        assert steps == {1}, levels
-        stamps = [frame.header.stamp_wall_ns for frame in frames]
-        rate_hz = 1e9 / float(np.median(np.diff(stamps)))
+        steps = np.diff(levels) % 8
+        gaps_s = np.diff([frame.header.stamp_wall_ns for frame in frames]) / 1e9
+        # Pictures are left out only where a busy computer let their time pass.
+        late = (steps > 1) & (gaps_s > 0.75 * steps / 20)
+        assert ((steps == 1) | late).all(), (levels, gaps_s)
+        rate_hz = 1.0 / float(np.median(gaps_s))
         assert rate_hz == pytest.approx(20, rel=RATE_TOLERANCE)
         told_hz = pytest.approx(20, rel=2 * RATE_TOLERANCE)
         until("it is told", lambda: rig.statuses[-1].rates_hz["front"] == told_hz)
