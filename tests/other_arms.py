@@ -9,7 +9,7 @@ from vla_zenoh.profile import Profile, load_profile, override
 SO101: dict[str, Any] = {
     "name": "so101",
     "command": "joint",
-    "description": "example-robot-data:so_arm_description/urdf/so101.urdf",
+    "description": "shipped:so101.urdf",
     "base_frame": "base_link",
     "tcp_frame": "gripper_frame_link",
     "arm_joints": ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"],
