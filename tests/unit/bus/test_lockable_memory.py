@@ -19,6 +19,8 @@ WITHOUT_CAPABILITY = (
     else []
 )
 SHOW = """
+from vla_zenoh.bus import shared_memory
+shared_memory.held_bytes = lambda: 0  # what other tests hold meanwhile is theirs
 from vla_zenoh.bus.session import session_config
 from vla_zenoh.bus.shared_memory import obstacle
 from vla_zenoh.profile import SessionProfile

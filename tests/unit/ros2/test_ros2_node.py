@@ -325,6 +325,10 @@ def test_depth_of_a_topic_of_its_own_goes_with_the_colours(tmp_path: Path) -> No
 
 
 # -- commands -------------------------------------------------------------------------------------
+FOLLOWED = 15
+"""Goals at the place of a stream that stands: those of a brake are not so many."""
+
+
 class Commander:
     """A command stream upwards, from where the robot is."""
 
@@ -341,14 +345,22 @@ class Commander:
         self._thread.start()
 
     def _run(self) -> None:
-        # It stands until it is followed: the first commands of a busy computer may be lost.
-        while not self._stop.wait(PERIOD_S) and len(self._goals) == self._before:
+        # It stands until it is followed: the first commands of a busy computer may be lost, and the
+        # first goals may still be those of the test before.
+        while not (self._stop.wait(PERIOD_S) or self._is_followed()):
             self.put(self._at_m)
         # A function of time, however late this thread is woken.
         began_s, start_m = time.monotonic(), self._at_m[2]
         while not self._stop.wait(PERIOD_S):
             self._at_m[2] = start_m + self._speed_m_s * (time.monotonic() - began_s)
             self.put(self._at_m, self._speed_m_s)
+
+    def _is_followed(self) -> bool:
+        newest = self._goals[self._before :][-FOLLOWED:]
+        heights_m = [goal.pose.position.z for goal in newest]
+        return (
+            len(newest) == FOLLOWED and np.ptp([*heights_m, self._at_m[2]]) < POSITION_TOLERANCE_M
+        )
 
     def put(self, at_m: Any, speed_m_s: float = 0.0) -> None:
         twist = np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
