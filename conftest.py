@@ -41,6 +41,10 @@ RUBBISH = 10_000
 """Objects between two searches for rubbish: with Python's 700 they take 3 of 100 seconds."""
 
 
+os.environ.setdefault("VLA_ZENOH_RENDERER", "raycast")
+"""Small images cost the same in both ways; whether OpenGL works takes a second to find out."""
+
+
 def pytest_configure() -> None:
     """End at once where this environment lacks a plug-in of this checkout: nothing would load."""
     there = entry_points()

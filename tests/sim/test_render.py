@@ -203,8 +203,8 @@ def test_a_driver_that_fails_is_noticed_in_a_process_of_its_own(
 
 def test_choosing_a_back_end_does_not_import_mujoco() -> None:
     code = (
-        "import sys; from vla_zenoh.simulation.backend import choose_backend; choose_backend(); "
-        "import vla_zenoh.simulation.backend; sys.exit('mujoco' in sys.modules)"
+        "import sys; from vla_zenoh.simulation.backend import choose_backend; "
+        "choose_backend('auto'); sys.exit('mujoco' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
     assert done.returncode == 0
