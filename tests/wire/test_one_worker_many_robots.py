@@ -47,6 +47,10 @@ IN_A_BATCH_S, OLDEST_OF_A_BATCH_S = 0.25, 0.6
 """What each robot adds to an inference, so that one for three robots is too late for all."""
 LEAST_SHARE = 0.3
 """Of its rate that a robot must be given on a busy computer; a held-up one gets nothing."""
+SAID_WHILE_LOADING = 10
+"""Times that a robot says everything before a model is loaded."""
+HEARD_S = 0.1
+"""Until what was said is there."""
 START_S = 40.0
 """From nothing to a worker that answers, on a busy computer."""
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -97,6 +101,11 @@ class Robot:
         had = len(self.chunks)
         return lambda: len(self.chunks) >= had + count
 
+    def said(self, times: int) -> Callable[[], bool]:
+        """Whether it said everything so many times since this was asked for."""
+        had = self._seq
+        return lambda: self._seq >= had + times
+
 
 class Together:
     """A model for many at once: what it gives a robot says whose turn it was.
@@ -133,6 +142,17 @@ class Together:
         steps = np.zeros((1, 6))
         steps[0, 0] = float(seen.prompt)
         return ActionSteps(np.full((1, 6), np.nan) if seen.prompt == "0" else steps)
+
+
+class Loading(Together):
+    """Infers once it is `loaded`: whoever has asked by then is in its first inference."""
+
+    def __init__(self, each_s: float) -> None:
+        super().__init__(each_s=each_s)
+        self.loaded = threading.Event()
+
+    def load(self) -> None:
+        assert self.loaded.wait(START_S)
 
 
 @pytest.fixture(scope="module")
@@ -269,12 +289,21 @@ def test_a_chunk_that_would_come_too_late_is_computed_when_it_keeps_no_other_rob
 def test_where_a_batch_of_all_is_too_late_for_all_they_are_answered_in_smaller_ones(
     profile: Profile, router: None
 ) -> None:
-    model = Together(each_s=IN_A_BATCH_S)
+    model = Loading(each_s=IN_A_BATCH_S)
     oldest = override(profile, {"timing": {"max_observation_age_s": OLDEST_OF_A_BATCH_S}})
     with served(oldest, model) as robots:
         for robot in robots.values():
             robot.asked(prompt="1", rate_hz=50.0)
-        until("a batch of all", lambda: set(ROBOTS) in map(set, model.batches))
+        for robot in robots.values():
+            until("all ask while it loads", robot.said(SAID_WHILE_LOADING))
+        for robot in robots.values():
+            robot.silent = True  # nobody is in the middle of a sentence when it begins
+        time.sleep(HEARD_S)
+        model.loaded.set()
+        until("an inference", lambda: model.batches)
+        assert set(model.batches[0]) == set(ROBOTS)
+        for robot in robots.values():
+            robot.silent = False
         had = {name: len(robot.chunks) for name, robot in robots.items()}
 
         def in_time(name: str) -> bool:
