@@ -10,6 +10,7 @@ import zenoh
 from camera_rig import free_endpoint, until
 from chain import READY_PATIENCE_S, write_profile
 from teleop_rig import Screen
+from web_rig import first_line
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile, override
@@ -23,8 +24,7 @@ def test_echo_names_the_key_that_was_meant_and_ends_with_the_router() -> None:
         echo = subprocess.Popen(
             [sys.executable, "-m", "vla_zenoh", *words], stderr=subprocess.PIPE, text=True
         )
-        assert echo.stderr is not None
-        hint = echo.stderr.readline()
+        hint = first_line(echo)
     _, said = echo.communicate(timeout=30.0)
     assert hint == "nothing on vla/panda/state/joints yet; did you mean 'state/joint'?\n"
     assert f"error: no Zenoh router answers at {endpoint}" in said
