@@ -80,7 +80,7 @@ class CommandedPart:
         self.tracking = TrackingMonitor(profile.limits, self.contact, self.states)
         self.monitors: list[Monitor] = [
             self.states,
-            NodeMonitor(),
+            NodeMonitor(profile.camera_servers()),
             self.contact,
             self.tracking,
             FollowMonitor(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 
 import numpy as np
@@ -117,13 +118,22 @@ class Watchdog:
 
 
 class NodeMonitor(Monitor):
-    """The nodes and cameras that an activation depends on."""
+    """The nodes and cameras that an activation depends on.
+
+    Args:
+        camera_servers: camera -> the node that serves it by the profile. What a node said of its
+            cameras is forgotten when it is gone.
+    """
+
+    def __init__(self, camera_servers: Mapping[str, str]) -> None:
+        self._camera_servers = camera_servers
 
     def check(self, part: PartSnapshot) -> Brake | None:
         assert part.lease is not None
         peers, cameras = part.peers, part.lease.spec.observation.camera_names
         needed = [peers.robot_node, worker_node(part.worker)]
-        needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
+        servers = {**self._camera_servers, **peers.camera_nodes}
+        needed += [servers[camera] for camera in cameras if camera in servers]
         for node in needed:
             if node not in peers.alive:
                 return Brake(f"node {node!r} is gone", late=False)

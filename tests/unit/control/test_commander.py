@@ -699,6 +699,21 @@ def test_a_camera_that_lies_ends_the_activation_by_name() -> None:
     rig.activate()
 
 
+@pytest.mark.parametrize("other", ["camera", "camera-2"])
+def test_a_camera_of_ros_2_is_gone_with_the_node_that_serves_it(other: str) -> None:
+    """What that node said of the camera is forgotten with it; another camera node lives on."""
+    front = {"front": profile().cameras["front"].model_copy(update={"source": "ros2:/front"})}
+    rig = Rig(profile().model_copy(update={"cameras": front}))
+    there = rig.peers
+    alive = (there.alive - {"camera"}) | {"ros2", other}
+    rig.peers = replace(there, alive=alive, same_host=alive, camera_nodes={"front": "ros2"})
+    rig.activate()
+    rig.peers = replace(rig.peers, alive=alive - {"ros2"}, camera_nodes={}, camera_ages_s={})
+    rig.tick()
+    assert rig.state == "inactive"
+    assert rig.commander.why == "node 'ros2' is gone"
+
+
 def test_a_camera_that_the_model_does_not_use_may_lie() -> None:
     rig = moving_rig()
     rig.peers = replace(rig.peers, camera_faults={"wrist": "is black"})
