@@ -263,8 +263,7 @@ class Follower:
 class Stepper:
     """A policy of joint deltas that asks for the same rates until `DROID_S` of them are asked for.
 
-    Of a chunk it counts what its next observation builds on, as the command node does: the first
-    step at once, a later one along its duration.
+    Of a chunk it counts what its next observation says of it: see `Observation.executed_steps`.
 
     Args:
         joints: names of the arm's.
@@ -286,16 +285,15 @@ class Stepper:
         )
         self._rates = rates
         self._times_s = np.arange(DROID_STEPS + 1) / DROID_HZ
-        self._last_ns, self._ends_s = 0, np.zeros(DROID_STEPS + 1)
+        self._ends_s = np.zeros(DROID_STEPS + 1)
         self.asked_s = 0.0
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk; no steps before the arm follows."""
         if not observation.task.active:
             return ActionSteps(np.zeros((DROID_STEPS, len(self._rates))))
-        since_s = max((observation.stamp_wall_ns - self._last_ns) / 1e9, 1 / DROID_HZ)
-        self.asked_s += float(np.interp(since_s, self._times_s, self._ends_s))
-        self._last_ns = observation.stamp_wall_ns
+        executed_s = (observation.executed_steps or 0.0) / DROID_HZ
+        self.asked_s += float(np.interp(executed_s, self._times_s, self._ends_s))
         self._ends_s = np.minimum(self._times_s, DROID_S - self.asked_s)
         return ActionSteps(np.diff(self._ends_s)[:, None] * self._rates)
 

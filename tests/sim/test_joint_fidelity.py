@@ -85,7 +85,7 @@ def test_five_joints_rest_where_they_were_asked_to(duration_s: float) -> None:
 @pytest.mark.parametrize("rate_hz", DROID_RATES_HZ)
 def test_steps_of_the_joints_are_carried_out_whole(rate_hz: float) -> None:
     found = carried_out(f"steps, {rate_hz:g} Hz", PANDA, "steps", rate_hz)
-    assert 0.98 < found["covered"] < 1.02, found
+    assert found["covered"] == pytest.approx(1.0, abs=1e-4), found
 
 
 def test_poses_for_five_joints_are_rejected_by_name() -> None:
