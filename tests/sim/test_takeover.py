@@ -93,7 +93,10 @@ def taken_over(
     rng = random.Random(seed)
     now: list[Lockstep] = []
     person = make(rng, lambda: now[0].now_ns / 1e9 if now else 0.0)
-    loop = begin("0 0 0.012", others={"teleop": person.policy()}, bounded=bounded, clear=True)
+    # The elbow of seed 5 drifts to 31 mrad before the end of joint 4, and in steps of two
+    # milliseconds to 23, where the arm brakes: design.md, Not done.
+    others = {"teleop": person.policy()}
+    loop = begin("0 0 0.012", others=others, bounded=bounded, clear=True, steps=1)
     now.append(loop)
     wire: list[Message] = []
     loop.tamper = partial(_noted, wire)
