@@ -260,7 +260,7 @@ def test_two_routers_that_are_linked_both_say_that_a_name_is_denied(tmp_path: Pa
         lab.secure("add", "desk", "--role", "operator")
         lab.router(HERE)
         lab.router("spare")
-        for _ in range(2):
+        for _ in range(5):  # where both opened anew at once one in four was never confirmed
             took_s = lab.secure("revoke", "desk")["in_force_after_s"]
             assert took_s.keys() == {"router-here", "router-spare"}
             assert max(took_s.values()) < MINUTE_S

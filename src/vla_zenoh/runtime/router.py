@@ -6,6 +6,7 @@ import errno
 import os
 import socket
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
@@ -26,6 +27,9 @@ from vla_zenoh.security.store import Store
 
 POLL_S = 0.25
 REOPEN_S = 10.0
+APART_S = 2.0
+"""Between two routers that open anew for the same names. Where linked routers do so at once, Zenoh
+1.9 can lose what the sessions of one subscribe to at the other, until they open anew themselves."""
 MAX_CLIENTS = 64
 RUNTIME_VARIABLE, RUNTIME = "ZENOH_RUNTIME", "(rx: (worker_threads: 16))"
 """A sample is forwarded by the thread that received it, which blocks on a stuck link. With Zenoh's
@@ -57,13 +61,20 @@ def run_router(
         seen, options = _session_of(profile, host, also, names)
         with open_session(seen.session, **options, wait_s=wait_s, stop=stop) as session:
             node = Node(options["identity"], seen, session, host=host, routes=True)
-            _route(node, names, stop)
+            _route(node, names, stop, _place(profile, options["identity"]) * APART_S)
             node.close()
         wait_s = REOPEN_S
 
 
-def _route(node: Node, names: Names, stop: threading.Event) -> None:
-    """Report, until `stop` is set or there are newer names."""
+def _place(profile: Profile, identity: str) -> int:
+    """Place of this router among those of the profile's hosts."""
+    hosts = [host for host, part in profile.hosts.items() if "router" in part.nodes]
+    names = [profile.node_name(host, "router") for host in hosts]
+    return names.index(identity) if identity in names else 0
+
+
+def _route(node: Node, names: Names, stop: threading.Event, wait_s: float) -> None:
+    """Report, until `stop` is set or there have been newer names for `wait_s`."""
     profile, session = node.profile, node.session
     expiry = CertificateExpiry(profile.session.security)
     clients = Clients(session)
@@ -74,14 +85,18 @@ def _route(node: Node, names: Names, stop: threading.Event) -> None:
     else:
         here = all(map(is_loopback, profile.session.listen))
         detail["security"] = "loopback" if here else "insecure"
+    newer_since_s: float | None = None
     while not stop.wait(POLL_S):
         detail |= {"clients": clients.known(), "links": len(list(session.info.links()))}
         if profile.session.security is not None:
             detail["certificates"] = expiry.outlook._asdict()
         node.publish_status("routing", detail=detail)
+        now_s = time.monotonic()
         with suppress(SecurityError):  # it is being copied
-            if _names(profile).revision > names.revision:
-                return
+            if newer_since_s is None and _names(profile).revision > names.revision:
+                newer_since_s = now_s
+        if newer_since_s is not None and now_s >= newer_since_s + wait_s:
+            return
 
 
 def _names(profile: Profile) -> Names:
