@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from made_arm import made_arm
 from motions import circle, follow, line, make_world, still, wait
 
+from vla_zenoh.profile import override
 from vla_zenoh.simulation.impedance import ImpedanceGains
+from vla_zenoh.simulation.pace import MAX_STEPS
 from vla_zenoh.simulation.scene import STEP_S
+from vla_zenoh.simulation.world import build_world
 
 FOLLOW_LIMIT_M = 1e-3
 FOLLOW_LIMIT_RAD = 5e-3
@@ -21,6 +27,8 @@ PRESS_MOVING_N = 10.0  # what a reference that still moves adds through the damp
 IMPACT_S = 0.1  # a moving arm that hits hard wood has to be stopped first
 TABLE_MARGIN_M = 1e-3
 FINGERTIP_BELOW_TCP_M = 0.0095
+LIGHT_WAY_M = (0.0, 0.0, 0.03)
+LIGHT_REST_RAD_S = 0.01
 
 COMPLIANT = ImpedanceGains(
     translational_n_m=400.0, rotational_nm_rad=20.0, max_error_m=0.06, max_error_rad=0.5
@@ -91,3 +99,25 @@ def test_a_reference_that_jumps_away_pulls_with_a_bounded_force() -> None:
         world.tick(far)
         speeds.append(np.linalg.norm(world.pose_state(far).twist[:3]))
     assert max(speeds) < 0.5  # 40 N against critical damping of some 200 Ns/m
+
+
+@pytest.mark.parametrize("steps", [1, 2, MAX_STEPS])
+@pytest.mark.parametrize("length_m", [0.15, 0.5, 1.0])
+@pytest.mark.parametrize(
+    ("chain", "home_rad"),
+    [("sztytz", [0.25, 0.1, 0.1]), ("tztytytytxtytz", [0.1, -0.6, 1.0, 0.6, 0.1, 0.5, 0.1])],
+)
+def test_an_arm_whose_links_have_a_few_grams_is_moved_and_comes_to_rest(
+    tmp_path: Path, chain: str, home_rad: list[float], length_m: float, steps: int
+) -> None:
+    made = made_arm(tmp_path, chain, length_m)
+    world = build_world(override(made, {"robot": {"home_rad": home_rad}}))
+    start = world.hold_reference()
+    up = list(line(start, LIGHT_WAY_M, 1.0))
+    for reference in up[::steps]:
+        world.tick(reference, steps)
+    end = still(up[-1])
+    for _ in range(round(1.0 / STEP_S / steps)):
+        world.tick(end, steps)
+    assert np.linalg.norm(world.tcp()[0] - end.position_m) < FOLLOW_LIMIT_M
+    assert np.abs(world.joint_state().velocity_rad_s).max() < LIGHT_REST_RAD_S

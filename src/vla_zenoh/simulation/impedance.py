@@ -19,6 +19,10 @@ control of robot manipulators: the operational space formulation*, IEEE J. Robot
 Redundant and Flexible-Joint Robots*, Springer 2008), which keeps the damping ratio in every pose;
 a constant matrix does not.
 
+The torque stands for a period ``T``, which a damped spring bears up to ``w T`` of about 1, with
+``w^2`` the greatest eigenvalue of ``K^1/2 Lambda^-1 K^1/2``. A light arm is pulled by a softer
+spring: K and ki K times ``min(1, (MAX_PHASE / (w T))^2)``.
+
 `JointImpedance` pulls every joint. With ``M`` the arm's inertia::
 
     e    = q_ref - q                                    clamped to ``max_error_rad``
@@ -49,6 +53,8 @@ from vla_zenoh.types import FloatArray, JointReference, PoseReference
 MIN_MOBILITY = 0.01
 """Task-space mobility (1/kg or 1/(kg m^2)) below which a direction counts as singular: its apparent
 inertia grows without bound, and so would damping and feed-forward."""
+MAX_PHASE = 0.6
+"""Greatest phase in rad by which the arm swings on its spring in a control period."""
 SAME_RAD = 1e-4
 """Joints that moved by less than this have the same inertia in task space and damping."""
 
@@ -67,9 +73,14 @@ class ArmDynamics(NamedTuple):
 
 
 class _TaskSpace(NamedTuple):
-    """Lambda, D (6, 6) and the transposed Jbar (6, n) of an arm with its joints at `at_rad`."""
+    """Lambda, D (6, 6) and the transposed Jbar (6, n) of an arm with its joints at `at_rad`.
+
+    `stiffness` is the share of K in use, for a control period of `period_s`.
+    """
 
     at_rad: FloatArray
+    period_s: float
+    stiffness: float
     inertia: FloatArray
     damping: FloatArray
     consistent: FloatArray
@@ -182,30 +193,44 @@ class CartesianImpedance(_Impedance):
         error[3:] = pin.log3(reference.rotation @ state.tcp_rotation.T)
         spring_error, feed = self._clamp(error)
 
-        _, inertia, damping, consistent = self._seen(state)
+        _, _, share, inertia, damping, consistent = self._seen(state)
         slip = feed * reference.twist - jacobian @ state.velocity_rad_s
-        wrench = self._stiffness * spring_error + damping @ slip + self.integral
+        wrench = share * self._stiffness * spring_error + damping @ slip + self.integral
         wrench += inertia @ (feed * reference.acceleration - state.drift)
         posture = self._posture_torque(state)
         wanted = transposed @ (wrench - consistent @ posture) + posture + state.bias_nm
         torque = _bounded(wanted, self._effort_nm)
         saturated = bool((torque != wanted).any())
-        self._integrate(spring_error, saturated or feed <= 0.0)
+        self._integrate(share * spring_error, saturated or feed <= 0.0)
         return ImpedanceOutput(torque, saturated, error, wrench)
 
     def _seen(self, state: ArmDynamics) -> _TaskSpace:
         """The arm in task space; kept while the joints stay where they are."""
-        known, position_rad = self._task_space, state.position_rad
-        if known is not None and float(np.abs(position_rad - known.at_rad).max()) < SAME_RAD:
+        known, position_rad, period_s = self._task_space, state.position_rad, self._period_s
+        if (
+            known is not None
+            and known.period_s == period_s
+            and float(np.abs(position_rad - known.at_rad).max()) < SAME_RAD
+        ):
             return known
         compliance = np.linalg.solve(state.inertia, state.jacobian.T)  # M^-1 J^T, (n, 6)
-        mobility, axes = np.linalg.eigh(state.jacobian @ compliance)
+        mobilities = state.jacobian @ compliance
+        mobility, axes = np.linalg.eigh(mobilities)
         mobility = np.maximum(mobility, MIN_MOBILITY)
         inertia = (axes / mobility) @ axes.T
-        half = ((axes / np.sqrt(mobility)) @ axes.T) * self._damping_scale
-        known = _TaskSpace(position_rad.copy(), inertia, half + half.T, inertia @ compliance.T)
+        share = self._bearable(mobilities)
+        half = ((axes / np.sqrt(mobility)) @ axes.T) * (math.sqrt(share) * self._damping_scale)
+        known = _TaskSpace(
+            position_rad.copy(), period_s, share, inertia, half + half.T, inertia @ compliance.T
+        )
         self._task_space = known
         return known
+
+    def _bearable(self, mobilities: FloatArray) -> float:
+        """The share of K, 0 to 1, that an arm of these mobilities (6, 6) bears for a period."""
+        root = np.sqrt(self._stiffness)
+        fastest = float(np.linalg.eigvalsh(root[:, None] * mobilities * root)[-1])
+        return min(1.0, (MAX_PHASE / self._period_s) ** 2 / max(fastest, 1e-12))
 
     def _clamp(self, error: FloatArray) -> tuple[FloatArray, float]:
         """Bounded stretch of the spring, and the share of the feed-forward that remains, 1 to 0.
