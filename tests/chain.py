@@ -411,6 +411,11 @@ class Chain:
     def pid(self, node: str) -> int:
         return self.until(f"node {node} runs", lambda: self.host.supervisor.pids().get(node))
 
+    def living(self) -> dict[str, int]:
+        """Node -> its process; of the router, and of nodes that live: no longer starting."""
+        pids, alive = self.host.supervisor.pids(), {"router", *self.client.alive}
+        return {node: pid for node, pid in pids.items() if node in alive}
+
     def measured(self) -> PoseState:
         return self.until("a measured pose", self.recorder.newest_state)
 

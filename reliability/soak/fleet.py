@@ -206,9 +206,9 @@ class Fleet:
         own = {
             f"{node} of {name}": pid
             for name, chain in self._robots.items()
-            for node, pid in chain.host.supervisor.pids().items()
+            for node, pid in chain.living().items()
         }
-        return own | self._gpu.host.supervisor.pids() | self._front
+        return own | self._gpu.living() | self._front
 
     def run(self, minutes: float) -> None:
         """So long; the last fifth without faults, in which nothing may grow."""

@@ -149,7 +149,7 @@ class Ledger:
     """Looks at processes every few seconds, in a thread, until `close`.
 
     Args:
-        pids: gives node -> process number of those that run now.
+        pids: gives node -> process number of those that run now, and are no longer starting.
     """
 
     def __init__(self, pids: Callable[[], Mapping[str, int]]) -> None:

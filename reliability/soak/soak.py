@@ -120,7 +120,7 @@ class Soak:
         }
         self._born_s: dict[str, tuple[int, float]] = {}
         self._refusals, self._witness = Refusals(), Witness()
-        self._ledger = Ledger(lambda: {**chain.host.supervisor.pids(), MEASURER: os.getpid()})
+        self._ledger = Ledger(lambda: {**chain.living(), MEASURER: os.getpid()})
 
     # -- all of it ----------------------------------------------------------------------------
     def run(self, minutes: float) -> Found:
