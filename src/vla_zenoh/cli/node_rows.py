@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from vla_zenoh.keys import CRASHED, ENDED, STARTING
@@ -19,7 +21,10 @@ MODE_WORDS = {
     UNKNOWN: ("MODE UNKNOWN", "no command node reports whether a robot moves", "bold"),
 }
 """Mode -> (prefix of what moves, sentence, style)."""
-MISSING, DEAD = "missing", "dead"
+MISSING, DEAD, UNREADABLE = "missing", "dead", "unreadable"
+STALE_S = 1.5
+"""Nodes publish their status twice a second."""
+NEVER = None, math.inf, False
 REAL_ROBOTS = frozenset({"arm", "ros2"})
 """Nodes in whose place `up --sim` starts the node sim."""
 
@@ -29,7 +34,8 @@ class NodeRow(NamedTuple):
 
     name: str  # on the bus
     host: str  # where it runs, or should run
-    state: str  # by its status (``ended`` if as it should), or missing, starting, crashed, dead
+    state: str  # by its status (``ended`` if as it should), or missing, starting, crashed, dead,
+    # unreadable
     why: str  # reason of such a state, with what to do; else empty
     status: NodeStatus | None  # the last one
     age_s: float | None  # of the status
@@ -37,19 +43,32 @@ class NodeRow(NamedTuple):
 
 
 def node_rows(
-    said: Statuses, expected: Mapping[str, str], alive: frozenset[str] = frozenset()
+    said: Statuses,
+    expected: Mapping[str, str],
+    alive: frozenset[str] = frozenset(),
+    unreadable: Mapping[str, str] = MappingProxyType({}),
 ) -> list[NodeRow]:
     """Every node that is alive or published a status, and those expected on running hosts, by name.
 
-    `expected` has the host of each node of the profile; `alive` nodes have a liveliness token.
+    `expected` has the host of each node of the profile; `alive` nodes have a liveliness token;
+    `unreadable` has why the newest status of a node cannot be read.
     """
     if "sim" in said and mode_of(said) == "sim":
         expected = {name: host for name, host in expected.items() if name not in REAL_ROBOTS}
     down = hosts_down(said, expected, alive)
-    names = {*said, *alive, *(name for name, host in expected.items() if host not in down)}
+    names = {
+        *said,
+        *alive,
+        *unreadable,
+        *(name for name, host in expected.items() if host not in down),
+    }
     rows: list[NodeRow] = []
     for name in sorted(names):
         host = expected.get(name, "")
+        if name in unreadable and said.get(name, NEVER)[1] > STALE_S:
+            why = one_line(unreadable[name])
+            rows.append(NodeRow(name, host, UNREADABLE, why, None, None, name in alive))
+            continue
         if name not in said:
             state, why = STARTING, "no status came from it yet; it starts, or is busy"
             if name not in alive:

@@ -55,12 +55,12 @@ def status(
 def _all_known(robot: Client) -> bool:
     """Whether every node that is there, or should be, has published its status."""
     nodes = robot.alive | robot.expected.keys()
-    return bool(robot.alive) and nodes <= robot.snapshot().keys()
+    return bool(robot.alive) and nodes <= robot.snapshot().keys() | robot.unreadable.keys()
 
 
 def _mapping(robot: Client) -> dict[str, object]:
     said = robot.snapshot()
-    rows = node_rows(said, robot.expected, robot.alive)
+    rows = node_rows(said, robot.expected, robot.alive, robot.unreadable)
     return {
         "robot": robot.keys.robot,
         "mode": mode_of(said),

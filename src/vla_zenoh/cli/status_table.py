@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
@@ -13,6 +14,7 @@ from rich.text import Text
 
 from vla_zenoh.cli.node_rows import (
     MODE_WORDS,
+    STALE_S,
     NodeRow,
     Statuses,
     acting_limits,
@@ -38,7 +40,6 @@ NARROW = 132
 """On a terminal of fewer columns a node has lines of its own in place of a row."""
 NARROW_LINES = 4
 """Of one message there."""
-STALE_S = 1.5
 STYLES = {
     "active": "bold green",
     "inactive": "cyan",
@@ -46,6 +47,7 @@ STYLES = {
     **dict.fromkeys(("holding", "waiting", "braking", "silent", "stalled", "unheeded"), "yellow"),
     **dict.fromkeys(("starting", "degraded"), "yellow"),
     **dict.fromkeys(("stopped", "latched", "fault", "dead", "missing", "crashed"), "bold red"),
+    "unreadable": "bold red",
 }
 LEVELS = {"warning": "yellow", "error": "red"}
 
@@ -73,6 +75,7 @@ def _now(robot: Client, events: Sequence[tuple[str, Header, Event]]) -> Group:
         left_out=robot.dropped,
         expected=robot.expected,
         alive=robot.alive,
+        unreadable=robot.unreadable,
         width=console().width,
     )
 
@@ -86,18 +89,20 @@ def render(
     left_out: int = 0,
     expected: Mapping[str, str] | None = None,
     alive: frozenset[str] = frozenset(),
+    unreadable: Mapping[str, str] = MappingProxyType({}),
     width: int = ENDLESS,
 ) -> Group:
     """The table of nodes and the events. Warnings come first: no table pushes them off the screen.
 
-    `left_out` counts statuses of unknown nodes that were not kept; `expected` and `alive` are those
-    of `node_rows`. On a terminal whose `width` is below `NARROW` there is no table: it would wrap
-    each message into dozens of lines.
+    `left_out` counts statuses of unknown nodes that were not kept; `expected`, `alive` and
+    `unreadable` are those of `node_rows`. On a terminal whose `width` is below `NARROW` there is no
+    table: it would wrap each message into dozens of lines.
     """
     mode, sentence, style = MODE_WORDS[mode_of(nodes)]
     title = Text.assemble((mode, style), printable(f" robot {robot}: {sentence}"))
     columns = ("node", "state", "age", "rate", "rejected", "message")
-    rows = [_cells(row, mode) for row in node_rows(nodes, expected or {}, alive)]
+    found = node_rows(nodes, expected or {}, alive, unreadable)
+    rows = [_cells(row, mode) for row in found]
     table: RenderableType
     if width < NARROW:
         table = Group(title, *(part for cells in rows for part in _paragraphs(cells, width)))

@@ -94,7 +94,14 @@ class NodeRegistry:
         self._lock = threading.Lock()
         self._alive: Bounded[str, None] = Bounded(MAX_NODES, self._is_expected)
         self._statuses: Bounded[str, tuple[NodeStatus, float]] = Bounded(MAX_NODES, self._rank)
+        self._unreadable: Bounded[str, str] = Bounded(MAX_NODES, self._is_expected)
         self._invalid = 0
+
+    @property
+    def unreadable(self) -> dict[str, str]:
+        """Node -> why its newest status cannot be read."""
+        with self._lock:
+            return dict(self._unreadable)
 
     @property
     def alive(self) -> frozenset[str]:
@@ -106,7 +113,8 @@ class NodeRegistry:
     def dropped(self) -> int:
         """Statuses and tokens that were not kept, or made room for others."""
         with self._lock:
-            return self._invalid + self._alive.dropped + self._statuses.dropped
+            kept = (self._alive, self._statuses, self._unreadable)
+            return self._invalid + sum(names.dropped for names in kept)
 
     def token_appeared(self, name: str) -> None:
         """A liveliness token appeared."""
@@ -126,6 +134,15 @@ class NodeRegistry:
         with self._lock:
             if self._fit(name) and size <= MAX_STATUS_BYTES:
                 self._statuses[name] = (status, self._clock())
+                self._unreadable.pop(name, None)
+            else:
+                self._invalid += 1
+
+    def status_unreadable(self, name: str, why: str) -> None:
+        """The status of the node that its key names cannot be read."""
+        with self._lock:
+            if self._fit(name):
+                self._unreadable[name] = why
             else:
                 self._invalid += 1
 
@@ -301,8 +318,10 @@ class StopClient(NodeRegistry):
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         found = self._decode(NodeStatus, sample, MAX_STATUS_BYTES)
-        if found is not None:
-            name = last_chunk(str(sample.key_expr))
+        name = last_chunk(str(sample.key_expr))
+        if found is None:
+            self.status_unreadable(name, self._unread[NodeStatus])
+        else:
             self.status_received(name, found[1], len(sample.payload))
 
     def _on_alive(self, sample: zenoh.Sample) -> None:

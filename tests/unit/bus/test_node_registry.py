@@ -65,10 +65,23 @@ def test_names_that_no_node_has_and_statuses_that_are_none_are_left_out() -> Non
     for name in ("", "x" * 1000, "a b", "[/x]", "..", "\x1b[2J", "ghost\n"):
         here.token_appeared(name)
         here.status_received(name, status(), SMALL)
+        here.status_unreadable(name, "junk")
     here.status_received("sim", status("sim"), MAX_STATUS_BYTES + 1)
-    assert here.snapshot() == {}
+    assert here.snapshot() == here.unreadable == {}
     assert here.alive == frozenset()
-    assert here.dropped == 15
+    assert here.dropped == 22
+
+
+def test_of_statuses_that_cannot_be_read_those_of_the_profile_s_nodes_stay() -> None:
+    here = NodeRegistry(OURS)
+    here.status_unreadable("sim", "schema 3")
+    for number in range(FLOOD):
+        here.status_unreadable(f"ghost{number}", "junk")
+    assert len(here.unreadable) <= MAX_NODES
+    assert here.unreadable["sim"] == "schema 3"
+    assert here.dropped >= FLOOD - MAX_NODES
+    here.status_received("sim", status("sim"), SMALL)
+    assert "sim" not in here.unreadable
 
 
 @given(

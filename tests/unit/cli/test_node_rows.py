@@ -51,6 +51,19 @@ def test_a_node_that_ended_well_is_not_dead_and_one_that_died_is(name: str) -> N
     assert row.state == "dead"
 
 
+def test_a_node_of_another_version_is_unreadable_with_what_to_update() -> None:
+    why = "status/command: schema 3 of the wire, this program has 2: update vla-zenoh"
+    (row,) = node_rows({}, {}, frozenset({"command"}), {"command": why})
+    assert (row.state, row.why, row.alive) == ("unreadable", why, True)
+
+
+@pytest.mark.parametrize(("age_s", "state"), [(0.4, "running"), (2.0, "unreadable")])
+def test_a_piece_of_junk_hides_no_node_whose_status_comes(age_s: float, state: str) -> None:
+    said = {"sim": (status("sim"), age_s, True)}
+    (row,) = node_rows(said, {}, frozenset({"sim"}), {"sim": "junk"})
+    assert row.state == state
+
+
 def test_a_node_of_the_profile_that_ended_is_missing() -> None:
     said = {**alive(status("command")), "sim": (status("sim", "ended"), 60.0, False)}
     rows = {row.name: row for row in node_rows(said, EXPECTED)}

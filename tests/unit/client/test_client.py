@@ -92,10 +92,14 @@ def test_a_person_with_another_version_is_told_which_side_to_update(
             patch.setattr(keys, "SCHEMA", keys.SCHEMA + theirs)
             header = records.encode_header(Header(1, 2, "command#1"))
         status = records.encode(NodeStatus("command", "inactive", "h", 1, 2))
+        ours = records.encode_header(Header(1, 2, "command#1"))
         there.put(profile.keys.status("command"), status, attachment=header)
         until("its status has come", lambda: client.other_version)
         with pytest.raises(SessionError, match=f"status/command: schema .* on {who}"):
             client.set_prompt("hold", 0.2)
+        assert who in client.unreadable["command"]
+        there.put(profile.keys.status("command"), status, attachment=ours)
+        until("it was updated", lambda: not client.unreadable)
         token.undeclare()
 
 

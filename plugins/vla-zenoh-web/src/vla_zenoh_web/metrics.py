@@ -27,7 +27,7 @@ STATES = (
     "active", "braking", "crashed", "dead", "degraded", "ended", "fault", "holding", "inactive",
     "inferring", "latched", "missing", "ok", "recording", "routing", "running", "silent",
     "stalled",
-    "starting", "stopped", "unheeded", "waiting",
+    "starting", "stopped", "unheeded", "unreadable", "waiting",
 )  # fmt: skip
 OTHER = "other"
 ARM = {

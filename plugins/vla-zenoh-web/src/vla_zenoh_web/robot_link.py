@@ -159,7 +159,7 @@ class RobotLink:
     # -- nodes --------------------------------------------------------------------------------
     def rows(self) -> list[NodeRow]:
         client = self.client
-        return node_rows(client.snapshot(), client.expected, client.alive)
+        return node_rows(client.snapshot(), client.expected, client.alive, client.unreadable)
 
     def state(self) -> dict[str, Any]:
         """State of the robot, from statuses and task."""

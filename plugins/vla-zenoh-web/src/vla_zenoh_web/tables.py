@@ -19,7 +19,7 @@ REFUSED = "refused."
 def node_table(client: Client) -> dict[str, Any]:
     """Nodes with rates, latencies and rejections; pairs of hosts with their clocks."""
     said = client.snapshot()
-    rows = node_rows(said, client.expected, client.alive)[:MAX_ROWS]
+    rows = node_rows(said, client.expected, client.alive, client.unreadable)[:MAX_ROWS]
     statuses = {name: found for name, (found, _, alive) in said.items() if alive}
     return {
         "nodes": [

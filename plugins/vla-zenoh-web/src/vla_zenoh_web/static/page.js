@@ -122,7 +122,7 @@ function showLink() {
 setInterval(showLink, 250);
 
 // -- state --------------------------------------------------------------------------------
-const GOOD = ["active", "inferring", "running", "routing", "ok"], BAD = ["stopped", "fault", "dead", "missing", "crashed"];
+const GOOD = ["active", "inferring", "running", "routing", "ok"], BAD = ["stopped", "fault", "dead", "missing", "crashed", "unreadable"];
 const level = (word) => (GOOD.includes(word) ? "good" : BAD.includes(word) ? "bad" : "warn");
 const MODES = { sim: "SIM", dry_run: "DRY RUN", live: "LIVE", unknown: "MODE UNKNOWN" };
 
