@@ -102,7 +102,7 @@ RIVALS := $(if $(ONLY),--only $(ONLY))
 test-rivals: $(READY) ## Run the tests against robots' packages of others on Zenoh, each in an environment of its own; ONLY=r2c,trossen
 	$(BIN)/python scripts/test_rivals.py $(RIVALS) $(AGAIN) $(ARGS) || $(BIN)/python scripts/test_rivals.py $(RIVALS) $(AT_THE_END) $(ARGS)
 
-demo-rivals: $(READY) ## Two robots of others on one bus, an agent, a cut link; log and pictures into runs/rivals
+demo-rivals: $(READY) ## Two other makers' robots on one bus, an agent, a cut link; log and pictures into runs/rivals
 	$(BIN)/python scripts/test_rivals.py --demonstration runs/rivals
 
 test-clients: $(READY) ## Build the clients of the wire in Rust and run their tests; needs cargo

@@ -1,1 +1,1 @@
-"""Two robots of others on one bus: a policy obeyed, one in shadow, a cut link, an agent."""
+"""Two other makers' robots on one bus: a policy obeyed, one in shadow, a cut link, an agent."""

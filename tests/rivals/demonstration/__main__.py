@@ -1,4 +1,4 @@
-"""Two robots of others on one bus; run it, and write its log and its pictures.
+"""Two other makers' robots on one bus; run it, and write its log and its pictures.
 
     make demo-rivals        # this, with both environments made
 
