@@ -86,8 +86,8 @@ class Scripted:
 
     def reset(self) -> None:
         """Restart the count."""
-        self._begun = 0.0, 0.0
-        self._last = [self._begun]
+        self._reached = [(0.0, 0.0)]
+        """Steps and distance, before the last chunk and after each of its steps."""
 
     def infer(self, observation: Observation) -> ActionSteps:
         """The next chunk of the motion the prompt names."""
@@ -97,28 +97,26 @@ class Scripted:
         if self._delay_s:
             time.sleep(self._delay_s * (1 + self._jitter * self._random.uniform(-1, 1)))
         # Of a chunk that the arm does not follow no step is executed, and none is counted.
-        if observation.executed_steps is not None:
-            self._begun = self._asked_by(observation.executed_steps)
-        begun, place = self._begun
+        begun, place = self._asked_by(observation.executed_steps or 0.0)
         horizon, limit = self.spec.action.horizon, asked.steps or math.inf
         ends = [min(begun + index, limit) for index in range(1, horizon + 1)]
         # No step twice: the chunk ends with the one that completes the count.
         ends = [ends[0], *(b for a, b in pairwise(ends) if b > a + ROUNDING)]
         steps = np.zeros((len(ends), self.spec.action.dimension), np.float32)
-        reached: list[tuple[float, float]] = []
+        reached = [(begun, place)]
         for row, end in enumerate(ends):
             before, place = place, asked.offset(end)
             reached.append((end, place))
             if asked.motion is not None:
                 steps[row, asked.motion.axis] = place - before
-        self._last = reached
+        self._reached = reached
         return ActionSteps(steps, asked.motion is None or ends[-1] >= limit - ROUNDING)
 
     def _asked_by(self, executed: float) -> tuple[float, float]:
         """Steps and distance requested by so many steps of the last chunk."""
         done = math.floor(executed)
-        if done >= len(self._last):
-            return self._last[-1]
-        (steps, place), (later_steps, later_place) = self._last[done - 1], self._last[done]
+        if done >= len(self._reached) - 1:
+            return self._reached[-1]
+        (steps, place), (later_steps, later_place) = self._reached[done : done + 2]
         share = executed - done
         return steps + share * (later_steps - steps), place + share * (later_place - place)

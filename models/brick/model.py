@@ -146,7 +146,7 @@ class Memory:
     Args:
         hand: at its last observation.
         prompt: of that.
-        asked: (H, 4) goals that its last chunk requested.
+        asked: (H + 1, 4) the goal from which its last chunk began, and those it requested.
     """
 
     hand: Hand | None = None
@@ -304,7 +304,8 @@ class Brick:
                 before = before + step
                 steps[row, MOVED] = step
                 steps[row, 6] = WIDTH_STEP_M if opened else -WIDTH_STEP_M
-        self._memory[observation.robot].asked = goal + np.cumsum(steps[:, MOVED], axis=0)
+        asked = goal + np.cumsum(steps[:, MOVED], axis=0)
+        self._memory[observation.robot].asked = np.concatenate([goal[None], asked])
         read = waypoints.order if waypoints.understood else "no task"
         return ActionSteps(steps.astype(np.float32), raw={"read": read})
 
@@ -376,8 +377,8 @@ def _goal(observation: Observation, hand: Hand, goals: FloatArray | None) -> Flo
         return here
     row = min(int(done), HORIZON - 1)
     share = done - row if done < HORIZON else 1.0
-    asked = goals[row - 1] + share * (goals[row] - goals[row - 1])
-    if at_rest and done > 1.0 and np.linalg.norm(np.ptp(goals[: row + 1, :3], axis=0)) < 1e-3:
+    asked = goals[row] + share * (goals[row + 1] - goals[row])
+    if at_rest and done > 1.0 and np.linalg.norm(np.ptp(goals[1 : row + 2, :3], axis=0)) < 1e-3:
         return np.append(here[:3], asked[3])
     return asked
 

@@ -50,6 +50,7 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.step_space import JointSteps, PoseSteps, Search, StepSpace
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.policy import ActionSpec
+from vla_zenoh.policy.plan_clock import least_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, Cause, FloatArray, JointState, PoseState, Stamped, Task
 
@@ -358,6 +359,7 @@ class ChunkPlanner:
             clock=timeline.clock,
             soonest=(action.pace if self._pace == "spec" else self._pace) == "soonest",
             idle_ns=timeline.idle_ns(observed_ns, effective_ns),
+            begin=None if least_steps(action, len(record.steps)) else base,
             action=action,
             space=space,
             steps=steps,

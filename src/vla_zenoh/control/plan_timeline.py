@@ -10,7 +10,8 @@ A chunk whose observation was taken at ``t_o`` asks for waypoints ``W_1 .. W_H``
     W_k = W_(k-1) o step_k         k = 1 .. H; or W_0 o step_k, see `ActionSpec.relative_to`
     in force at t: W_k, k = floor((t - t_1) / dt) + 1, at least 1 and at most H
 
-    G(t) = W_s, s = (t - t_1) / dt, at least 1 and at most H, between two waypoints interpolated
+    G(t) = W_s, s = (t - t_1) / dt, at most H, between two waypoints interpolated
+    s    at least 1 for a chunk of one delta, see `first_step_counts_whole`
 
 Where a controller covers only a part of each step, its response is what is interpolated, and its
 rate is part of W and G. Between chunks it stands still, as a simulator does during inference.
@@ -26,9 +27,10 @@ passes then, since its goal would run ahead of an arm which cannot be faster tha
 Where plans overlap, the goal that is followed may be a blend of several (`PlanAggregator`); ``G``
 is that of the newest plan in every mode.
 
-A chunk that is replaced halfway counts for the time it had, and for its first step at least: the
-speed a model asks for does not depend on how often it is asked, and a single step is a step. Steps
-are counted in the same way: a plan starts with the number that its ``W_0`` stands for.
+A chunk that is replaced counts for the time it had, be that less than a step: the speed a model
+asks for does not depend on how often it is asked. A chunk of one delta is a step, however soon the
+next one comes. Steps are counted in the same way: a plan starts with the number that its ``W_0``
+stands for.
 
 All of this is in plan time, which is wall time while the speed override is 100 %. At an override of
 share ``s`` plan time passes ``s`` times as fast: each step takes ``dt / s``, and the goals are the
@@ -162,6 +164,7 @@ class Plan:
         soonest: the arm moves to each goal as fast as it can, and waits there for the next one.
         idle_ns: plan time from the observation to the window of the first step, in which no plan
             ran.
+        begin: the goal from which the first step counts by its time; None: it counts as a whole.
     """
 
     effective_ns: int
@@ -179,6 +182,7 @@ class Plan:
     clock: PlanClock = WALL_CLOCK
     soonest: bool = False
     idle_ns: int = 0
+    begin: Goal | None = None
     _start_ns: int = field(init=False)  # in plan time
 
     def __post_init__(self) -> None:
@@ -203,19 +207,19 @@ class Plan:
         return min(self.due_index(t_ns), self.bounded - 1)
 
     def goal_at(self, t_ns: int) -> Goal:
-        """G(t): what its steps have asked for until `t_ns`, its first step at least."""
-        done, part_ns = divmod(self.elapsed_ns(t_ns), self.dt_ns)
-        if done < 1:
-            return self.goals[0]
-        if done >= self.bounded or part_ns == 0:
+        """G(t): what its steps have asked for until `t_ns`."""
+        least_ns = self.dt_ns if self.begin is None else 0
+        done, part_ns = divmod(max(self.elapsed_ns(t_ns), least_ns), self.dt_ns)
+        if done >= self.bounded or (done and part_ns == 0):
             return self.goals[min(done, self.bounded) - 1]
-        dt_s = self.dt_ns / 1e9
-        return self.goals[done - 1].between(self.goals[done], part_ns / self.dt_ns, dt_s)
+        before = self.goals[done - 1] if done else self.begin
+        assert before is not None  # it counts as a whole, so done is 1 at least
+        return before.between(self.goals[done], part_ns / self.dt_ns, self.dt_ns / 1e9)
 
     def steps_until(self, t_ns: int) -> float:
         """Steps of the episode asked for until `t_ns`, including parts of one."""
-        elapsed = self.elapsed_ns(t_ns) / self.dt_ns
-        return min(self.steps_before + min(max(elapsed, 1.0), self.bounded), self.steps_total)
+        elapsed, least = self.elapsed_ns(t_ns) / self.dt_ns, 1.0 if self.begin is None else 0.0
+        return min(self.steps_before + min(max(elapsed, least), self.bounded), self.steps_total)
 
     def steps_in_force(self, t_ns: int) -> float:
         """Steps of the episode in force until `t_ns`, the present one as a whole."""

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import SpecError, in_words
 from vla_zenoh.policy.meaning import RotationForm, nearest_turn, toward, unturned, wrapped
-from vla_zenoh.policy.plan_clock import PlanClock, idle_time
+from vla_zenoh.policy.plan_clock import PlanClock, idle_time, least_steps
 from vla_zenoh.policy.spec import ActionSpec, ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
@@ -85,8 +85,9 @@ class Observation:
         robot: its name, for a model that serves several and keeps state of each.
         parts: of a robot of several parts, name -> the same with the state of that part, all of one
             time; the observation itself then has no joint, pose and gripper.
-        executed_steps: how many steps of the model's last chunk were executed when it was taken, at
-            least its first one, with parts of a step; None: the arm followed none in this episode.
+        executed_steps: how many steps of the model's last chunk were executed when it was taken,
+            with parts of a step; of a chunk of one delta all of it; None: the arm followed none in
+            this episode.
     """
 
     stamp_wall_ns: int
@@ -356,8 +357,8 @@ class ChunkPrefix:
             return None
         clock = self._plan_time(observation)
         passed_ns = clock.at(observation.stamp_wall_ns) - last.begin(clock)
-        # The command node starts the first step at once; see control/plan_timeline.py.
-        return min(max(passed_ns / 1e9 / self._action.dt_s, 1.0), float(len(last.steps)))
+        executed, count = passed_ns / 1e9 / self._action.dt_s, len(last.steps)
+        return min(max(executed, least_steps(self._action, count)), float(count))
 
     def _plan_time(self, observation: Observation) -> PlanClock:
         return self._clock or PlanClock(observation.task.speed)

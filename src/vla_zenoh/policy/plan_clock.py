@@ -6,11 +6,19 @@ The first step of a chunk begins at its observation, later by the time until its
 which no step of an earlier chunk was left (`idle_time`). The arm stood then, and the observation
 shows what it still showed at the publication. So no step of a first chunk, or of one after a pause,
 is skipped because its inference took time.
+
+Of a chunk that is replaced as much was executed as it had time for, so the speed that a model asks
+for does not depend on how often it is asked. A chunk of one delta has no speed, it is a step: all
+of it was executed, however soon it is replaced (`least_steps`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from vla_zenoh.policy.spec import ActionSpec
 
 HISTORY_NS = 15_000_000_000
 """Observations are rejected long before they are this old."""
@@ -32,6 +40,11 @@ def idle_time(begin: float, end: float, runs: Iterable[tuple[float, float]]) -> 
         idle -= max(min(over, replaced) - max(published, begin), 0.0)
         replaced = min(replaced, published)
     return max(idle, 0.0)
+
+
+def least_steps(action: ActionSpec, steps: int) -> float:
+    """How many of the `steps` of a chunk are executed at least, once it is in force."""
+    return 1.0 if steps == 1 and action.kind != "velocity" else 0.0
 
 
 class PlanClock:

@@ -178,8 +178,8 @@ def test_until_a_chunk_is_bounded_the_one_before_it_stays_in_force() -> None:
         out, waited = rig.tick(), waited + 1
     assert 0 < waited <= math.ceil(PATIENCE / rig.commander._planner.budget)
     rig.settle(2.0)
-    # The first step of the first, in whose time the second was observed, and all of the second.
-    np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.01 * 25], atol=AT_GOAL_M)
+    # Of the first what it had time for, 12 ms, until the second was observed; all of the second.
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.01 * 24.12], atol=AT_GOAL_M)
     rig.assert_smooth()
 
 
@@ -208,7 +208,8 @@ def test_chunks_that_come_while_another_is_bounded_lose_no_step() -> None:
         rig.tick(chunks=[rig.chunk([up] * 12, observed_ago_s=0.2, published_ago_s=0.02)])
         rig.tick(chunks=[rig.chunk([up], observed_ago_s=0.01)])
         rig.run(0.3)
-        asked += 1 + 1 + (0.2 + 0.004 - 0.01) / 0.02
+        # One tick of the first, of the second until the third was observed, and the third.
+        asked += 0.004 / 0.02 + (0.2 + 0.004 - 0.01) / 0.02 + 1
     assert rig.refused == {}
     rig.settle(2.0)
     np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.004 * asked], atol=AT_GOAL_M)

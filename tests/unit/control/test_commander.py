@@ -252,10 +252,10 @@ def test_steps_whose_time_has_passed_while_another_chunk_ran_are_skipped_and_no_
     rig.run(0.346)
     out = rig.send([UP] * 8, observed_ago_s=0.34)
     assert out.pose is not None
-    # One step of the first chunk and four of the second.
-    np.testing.assert_allclose(out.pose.goal_position_m, START_M + [0, 0, 0.05])
+    # 20 ms of the first chunk and four steps of the second.
+    np.testing.assert_allclose(out.pose.goal_position_m, START_M + [0, 0, 0.042])
     rig.settle()
-    np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.09], atol=AT_GOAL_M)
+    np.testing.assert_allclose(rig.moved_m(), [0, 0, 0.082], atol=AT_GOAL_M)
     rig.assert_smooth()
 
 

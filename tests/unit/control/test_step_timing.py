@@ -11,6 +11,8 @@ from functools import cache
 import numpy as np
 import pytest
 from command_rig import MS, OFTEN, Rig, profile
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from vla_zenoh.control.limits import motion_limits
 from vla_zenoh.control.plan_timeline import Goal, Plan
@@ -26,6 +28,7 @@ UNEVEN_RIPPLE = 0.5
 STOP_AND_GO = 1.5
 AT_GOAL_M = 1e-6
 STEP_M, STEPS = 0.01, 24
+SPEED_M_S, ONE_TICK_M = 0.03, 0.03 * 0.012
 PICTURE_NS, CAMERA_NS = 33_333_333, 15 * MS
 PATH_M = 1e-5
 LIMIT = 1 + 1e-6
@@ -44,6 +47,7 @@ class Worker:
     seed: int = 0
     done: bool = False
     ends: list[float] = field(default_factory=list)
+    """Steps asked for before the last chunk, and after each of its steps."""
 
     def __post_init__(self) -> None:
         self._random = random.Random(self.seed)
@@ -76,8 +80,8 @@ class Worker:
             self.done = True
             return
         ends = [min(begun + step, STEPS) for step in range(1, self.horizon + 1)]
-        self.ends = [ends[0], *(b for a, b in itertools.pairwise(ends) if b > a + 1e-6)]
-        ways = np.diff([begun, *self.ends]) * STEP_M
+        self.ends = [begun, ends[0], *(b for a, b in itertools.pairwise(ends) if b > a + 1e-6)]
+        ways = np.diff(self.ends) * STEP_M
         steps = [[0.0, 0.0, way, 0.0, 0.0, 0.0, 0.0] for way in ways]
         takes_s = self.inference_s * (1 + self.jitter * self._random.uniform(-1, 1))
         self._free_ns = now_ns + round(takes_s * 1e9)
@@ -90,7 +94,8 @@ class Worker:
         if not self.ends:
             return 0.0
         had = (seen_ns - self._last_ns) * self.speed / 1e9 / self.dt_s
-        return float(np.interp(max(had, 1.0), np.arange(1, len(self.ends) + 1), self.ends))
+        least = 1.0 if len(self.ends) == 2 else 0.0
+        return float(np.interp(max(had, least), np.arange(len(self.ends)), self.ends))
 
     @property
     def arrived(self) -> bool:
@@ -158,6 +163,29 @@ def test_a_step_that_nothing_follows_ends_at_its_goal_before_the_watchdog_brakes
         rig.tick()
     assert rig.state == "holding"
     np.testing.assert_allclose(rig.position_m - begun_m, [0.03, 0.0, 0.0], atol=AT_GOAL_M)
+
+
+@settings(max_examples=15)
+@given(
+    st.sampled_from(["delta", "velocity"]),
+    st.sampled_from([100.0, 30.0]),
+    st.lists(st.integers(2, 24), min_size=30, max_size=30),
+)
+def test_the_speed_a_model_asks_for_does_not_depend_on_how_often_it_is_asked(
+    kind: str, percent: float, ticks: list[int]
+) -> None:
+    rig = Rig(profile(timing=OFTEN), horizon=8, dt_s=0.1, kind=kind, rotation="rotvec")
+    rig.activate()
+    rig.put("speed", percent)
+    per_step = SPEED_M_S * (1.0 if kind == "velocity" else 0.1)
+    begun_m = rig.position_m
+    for count in ticks:
+        rig.send([[per_step, 0, 0, 0, 0, 0, 0]] * 8)
+        rig.run(count * rig.period_ns / 1e9)
+    asked_s = (sum(ticks) + len(ticks)) * rig.period_ns / 1e9 * percent / 100.0
+    goal_m = rig.commander.parts[0].motion.timeline.at(rig.now_ns).pose.position_m
+    np.testing.assert_allclose(goal_m - begun_m, [SPEED_M_S * asked_s, 0, 0], atol=ONE_TICK_M)
+    rig.assert_smooth()
 
 
 # -- the speed override -----------------------------------------------------------------------

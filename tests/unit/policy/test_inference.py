@@ -18,6 +18,7 @@ from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.recording.run import RecordedSample
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation
 from vla_zenoh.policy.inference import ChunkPrefix, Committed, rest_of
+from vla_zenoh.policy.spec import MotionKind
 from vla_zenoh.types import ActionChunk, Cause, Header, Task
 
 ATOL = 1e-6  # steps travel as float32
@@ -80,10 +81,22 @@ def test_an_observation_within_a_step_cuts_the_path_anew() -> None:
     assert committed.frozen == 3
 
 
-def test_the_first_step_counts_as_asked_for_at_once() -> None:
+def test_of_a_chunk_that_is_replaced_within_its_first_step_that_part_was_executed() -> None:
     committed = told(30, 100)
     assert committed is not None
-    np.testing.assert_allclose(committed.steps, ramp()[1:], atol=ATOL)
+    np.testing.assert_allclose(
+        committed.steps[:, 0], 0.7 * ramp()[:-1, 0] + 0.3 * ramp()[1:, 0], atol=ATOL
+    )
+
+
+@pytest.mark.parametrize(("kind", "executed"), [("delta", 1.0), ("velocity", 0.3)])
+def test_a_chunk_of_one_delta_is_a_step_and_of_one_velocity_what_it_had_time_for(
+    kind: MotionKind, executed: float
+) -> None:
+    action = ActionSpec(horizon=1, dt_s=0.1, kind=kind, rotation="rotvec", gripper="none")
+    prefix = ChunkPrefix(Model(action))
+    prefix.published(seen(0), np.zeros((1, 6), np.float32), seen(0).stamp_wall_ns, obeyed=True)
+    assert prefix.with_progress(seen(30)).executed_steps == pytest.approx(executed)
 
 
 def test_nothing_is_committed_by_who_is_not_obeyed_nor_in_another_episode_nor_when_over() -> None:
@@ -276,13 +289,14 @@ def test_worker_command_node_and_data_set_count_the_same_steps(
         tasks.append(recorded(replace(task, speed_percent=100.0 * share), time_ms))
     plan = Plan(published_ns, zero_ns, 100 * MS, goals, cause)
     plan.idle_ns = timeline.idle_ns(zero_ns, published_ns)
+    plan.begin = goals[0]
     timeline.add(plan, published_ns)
     end_ns = zero_ns + at_ms * MS
     executed = timeline.plan.steps_until(end_ns)
     begin_ns = step_begins(tasks, followed, {"": 0.1})[followed[-1].header]
     exported = StepClock(tasks, zero_ns, end_ns, 0.1)
     exported = exported.steps(end_ns) - exported.steps(begin_ns)
-    assert min(max(exported, 1.0), 8.0) == pytest.approx(executed, abs=1e-4)
+    assert min(max(exported, 0.0), 8.0) == pytest.approx(executed, abs=1e-4)
     committed = told_under(overrides, at_ms, published_ms=published_ms, stood=stood)
     if committed is None:
         assert executed > 7.0 - 1e-3
