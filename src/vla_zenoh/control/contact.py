@@ -48,8 +48,9 @@ DRIFT_S = 10.0
 """Shorter: a push slows the arm down for a moment only; longer: a load just picked up does."""
 LONGEST_S = 0.1
 """Longest time between two states that the filters integrate."""
-FROZEN_M = 0.05
-"""A wrench that stays the same to the last bit while the TCP moves this far is not measured."""
+FROZEN_M, FROZEN_RAD = 0.05, 0.2
+"""A wrench that stays the same to the last bit while the TCP moves this far is not measured, nor
+are efforts while the joints move this far (m for those that slide)."""
 UNTOUCHED = 0.2
 """Part of ``slow`` below which the arm is not in contact."""
 
@@ -142,14 +143,32 @@ def _greatest(values: FloatArray) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
+class Repetition:
+    """Whether a reading stays the same to the last bit while the arm moves further than `most`."""
+
+    def __init__(self, most: float) -> None:
+        self._most = most
+        self._first: tuple[FloatArray, FloatArray] | None = None
+
+    def add(self, reading: FloatArray, place: FloatArray) -> bool:
+        """Add a reading that was taken at this place (n,)."""
+        first = self._first
+        if first is None or not np.array_equal(reading, first[0]):
+            self._first = reading, place
+            return False
+        return _norm(place - first[1]) > self._most
+
+
 class Contact(Monitor):
     """The external load on the arm, as far as the robot measures it.
 
     Args:
         limits: slow and stop of each kind of load.
+        simulated: the robot is, so a wrench of zeros is that of an arm which touches nothing; a
+            real sensor has noise.
     """
 
-    def __init__(self, limits: ContactLimits) -> None:
+    def __init__(self, limits: ContactLimits, *, simulated: bool = False) -> None:
         self._force = Load("contact_force", "N", limits.force_slow_n, limits.force_stop_n, _norm)
         self._torque = Load(
             "contact_torque", "Nm", limits.torque_slow_nm, limits.torque_stop_nm, _norm
@@ -164,8 +183,8 @@ class Contact(Monitor):
         self._begun: list[Load] = []
         self._reported = True
         """What was told last about `known`."""
-        self._unchanged: tuple[FloatArray, FloatArray] | None = None
-        """The newest wrench, and where the TCP was when it was first reported."""
+        self._simulated = simulated
+        self._wrenches, self._efforts = Repetition(FROZEN_M), Repetition(FROZEN_RAD)
 
     @property
     def _measured(self) -> list[Load]:
@@ -176,25 +195,20 @@ class Contact(Monitor):
     def update_pose(self, state: Stamped[PoseState]) -> None:
         """Add the newest pose, with the wrench if the robot measures one."""
         wrench, stamp_ns = state.record.wrench, state.header.stamp_wall_ns
-        if wrench is not None and self._is_frozen(wrench, state.record.position_m):
-            wrench = None
+        if wrench is not None and self._wrenches.add(wrench, state.record.position_m):
+            wrench = wrench if self._simulated and not wrench.any() else None
         force, torque = (None, None) if wrench is None else (wrench[:3], wrench[3:])
         for load, measured in ((self._force, force), (self._torque, torque)):
             load.update(measured, stamp_ns, drifts=self._active)
 
-    def _is_frozen(self, wrench: FloatArray, position_m: FloatArray) -> bool:
-        """The same numbers again, other than zero, however far the arm has moved meanwhile."""
-        before = self._unchanged
-        if before is None or not wrench.any() or not np.array_equal(wrench, before[0]):
-            self._unchanged = wrench, position_m
-            return False
-        return norm3(position_m - before[1]) > FROZEN_M
-
     def update_joints(self, state: Stamped[JointState]) -> None:
         """Add the newest joints; used if a limit of the profile says that efforts are external."""
         if self.wants_effort:
-            stamp_ns = state.header.stamp_wall_ns
-            self._effort.update(state.record.effort_nm, stamp_ns, drifts=self._active)
+            joint, stamp_ns = state.record, state.header.stamp_wall_ns
+            effort = joint.effort_nm
+            if effort is not None and self._efforts.add(effort, joint.position_rad):
+                effort = None
+            self._effort.update(effort, stamp_ns, drifts=self._active)
 
     def begin(self) -> None:
         """Start an activation: the present load is not a contact."""
@@ -231,7 +245,11 @@ class Contact(Monitor):
         """Which load the robot measured when the activation began and does not now."""
         for load in self._begun:
             if not load.known:
-                return f"the robot no longer measures {load.name}, which limits.contact needs"
+                return (
+                    f"the robot no longer measures {load.name}, which limits.contact needs: it "
+                    "reports none, or the same numbers while it moves (one without a sensor should "
+                    "report none)"
+                )
         return ""
 
     def reasons(self, part: PartSnapshot) -> list[str]:

@@ -86,7 +86,8 @@ class MotionPipeline:
         self.scaling = SpeedScaling()
         self.must_pause = False
         """Another part is too near: the arm has to pause."""
-        self.contact = Contact(profile.limits.contact)
+        simulated = profile.robot.driver == "sim"
+        self.contact = Contact(profile.limits.contact, simulated=simulated)
         self.retreat = Retreat(profile.limits, self.contact)
         self._back: Pose | None = None
         """Where it retreats to."""

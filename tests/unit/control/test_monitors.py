@@ -146,19 +146,40 @@ def test_an_arm_that_is_pressed_harder_than_the_stop_is_not_activated() -> None:
     assert any("contact_force is 41.0 N at rest" in why for why in contact.missing)
 
 
-def test_a_wrench_that_stays_the_same_while_the_arm_moves_is_not_measured() -> None:
+@pytest.mark.parametrize("force_n", [(1.0, 2.0, 3.0), (0.0, 0.0, 0.0)])
+def test_a_wrench_that_stays_the_same_while_the_arm_moves_is_not_measured(
+    force_n: tuple[float, ...],
+) -> None:
     contact = Contact(ContactLimits())
-    contact.update_pose(pressed(np.array([1.0, 2.0, 3.0]), START_NS))
+    contact.update_pose(pressed(np.array(force_n), START_NS))
     contact.begin()
     for tick in range(100):
-        state = pressed(np.array([1.0, 2.0, 3.0]), START_NS + 4 * MS * tick)
+        state = pressed(np.array(force_n), START_NS + 4 * MS * tick)
         at_m = START_M + [0.0, 0.0, 0.001 * tick]
         contact.update_pose(replace(state, record=replace(state.record, position_m=at_m)))
     assert "no longer measures contact_force" in contact.lost
+    assert "report none" in contact.lost
 
 
-def test_a_robot_that_reports_no_force_at_all_may_move_as_far_as_it_likes() -> None:
-    contact = Contact(ContactLimits())
+@pytest.mark.parametrize("effort_nm", [(0.0, 0.0), (1.0, 2.0)])
+@pytest.mark.parametrize(("moves", "why"), [(0.0, ""), (0.003, "measures contact_effort")])
+def test_efforts_that_stay_the_same_while_the_joints_move_are_not_measured(
+    effort_nm: tuple[float, ...], moves: float, why: str
+) -> None:
+    contact = Contact(ContactLimits(effort_stop_nm=10.0))
+    for tick in range(100):
+        at_rad = np.array([moves * tick, 0.0])
+        state = JointState(("one", "two"), at_rad, np.zeros(2), np.array(effort_nm))
+        now_ns = START_NS + 4 * MS * tick
+        contact.update_joints(Stamped(Header(now_ns, tick, "arm-1"), state, now_ns))
+        if tick == 0:
+            contact.begin()
+    assert why in contact.lost
+    assert bool(contact.lost) == bool(why)
+
+
+def test_a_simulated_arm_that_touches_nothing_may_move_as_far_as_it_likes() -> None:
+    contact = Contact(ContactLimits(), simulated=True)
     contact.update_pose(pressed(np.zeros(3), START_NS))
     contact.begin()
     for tick in range(100):
