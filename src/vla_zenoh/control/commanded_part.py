@@ -332,10 +332,10 @@ class CommandedPart:
         if retreats and part.commanded is not None:
             self.retreat.begin(part.commanded)
         why = (
-            f"{load.name} {load.value:.1f} {load.unit} presses on the arm where it came to rest; "
+            f"{load} presses on the arm where it came to rest; "
             + ("it retreats" if self.retreat.busy else "it stays there")
         )
-        return make_event("warning", "notice", "pressed", why, load.value, load.slow)
+        return make_event("warning", "notice", "pressed", why, load.most, load.slow)
 
     def follow_elbow(self, *, obeying: bool) -> None:
         """Begin to bound the next step with the elbow of the commanded or measured joints.

@@ -99,6 +99,9 @@ class Load:
         self.most = 0.0
         """The size of the load that counts for the stop, in N or Nm: no bias follows it."""
 
+    def __str__(self) -> str:
+        return f"{self.name} {self.most:.1f} {self.unit}"
+
     def update(self, measured: FloatArray | None, stamp_ns: int, *, drifts: bool) -> None:
         """Add what was measured at `stamp_ns`, None: nothing; `drifts`: let the bias follow."""
         if measured is None:
@@ -187,7 +190,7 @@ class Contact(Monitor):
         self._wrenches, self._efforts = Repetition(FROZEN_M), Repetition(FROZEN_RAD)
 
     @property
-    def _measured(self) -> list[Load]:
+    def measured(self) -> list[Load]:
         """The loads that the robot measures."""
         return [load for load in self._all if load.known]
 
@@ -212,7 +215,7 @@ class Contact(Monitor):
 
     def begin(self) -> None:
         """Start an activation: the present load is not a contact."""
-        self._active, self._begun = True, self._measured
+        self._active, self._begun = True, self.measured
         for load in self._begun:
             load.zero()
 
@@ -261,7 +264,7 @@ class Contact(Monitor):
             return Brake(self.lost) if self.lost else None
         event = make_event("warning", "limit", load.name, "stopped", load.most, load.stop)
         why = (
-            f"something presses against the arm: {load.name} {load.most:.1f} {load.unit}, "
+            f"something presses against the arm: {load}, "
             f"at most {load.stop:g} {load.unit}; it retreats"
         )
         return Brake(why, event, retreats=True)
@@ -272,7 +275,7 @@ class Contact(Monitor):
         reasons = [
             f"{load.name} is {load.most:.1f} {load.unit} at rest, which is more than its stop of "
             f"{load.stop:g} {load.unit}: free the arm, or zero the robot's sensor"
-            for load in self._measured
+            for load in self.measured
             if load.most > load.stop
         ]
         if self.wants_effort and not self._effort.known:
@@ -295,27 +298,27 @@ class Contact(Monitor):
     @property
     def pressing(self) -> float:
         """The greatest load as a part of its stop."""
-        return max((load.most / load.stop for load in self._measured), default=0.0)
+        return max((load.most / load.stop for load in self.measured), default=0.0)
 
     @property
     def quiet(self) -> bool:
         """No contact, as far as the robot measures it."""
-        return all(load.value <= UNTOUCHED * load.slow for load in self._measured)
+        return all(load.value <= UNTOUCHED * load.slow for load in self.measured)
 
     def overload(self) -> Load | None:
         """The load above its stop limit, None without one."""
-        return next((load for load in self._measured if load.most > load.stop), None)
+        return next((load for load in self.measured if load.most > load.stop), None)
 
     def touching(self) -> Load | None:
         """The load furthest above its slow limit, None without one."""
-        loads = [load for load in self._measured if load.value > load.slow]
+        loads = [load for load in self.measured if load.value > load.slow]
         return max(loads, key=lambda load: load.value / load.slow, default=None)
 
     @property
     def slowdown(self) -> Slowdown | None:
         """The slowdown of the greatest load, None without one."""
         slower: Slowdown | None = None
-        for load in self._measured:
+        for load in self.measured:
             if load.value <= load.slow:
                 continue
             left = max((load.stop - load.value) / max(load.stop - load.slow, 1e-9), 0.0)
@@ -503,7 +506,6 @@ class Retreat:
 
     def _finish(self, why: str) -> tuple[Pose | None, Event | None]:
         self.end()
-        force_n = self._contact.force_n
-        force = "" if force_n is None else f", external force {force_n:.1f} N"
-        why = f"the arm retreated: {why}{force}"
+        loads = ", ".join(map(str, self._contact.measured))
+        why = f"the arm retreated: {why}{loads and f' ({loads})'}"
         return None, make_event("info", "notice", "retreat", why)

@@ -49,6 +49,16 @@ def active(**limits: Any) -> Arm:
     return arm
 
 
+def test_a_load_that_rises_slowly_is_told_as_the_robot_reports_it() -> None:
+    arm = active(force_slow_n=15.0)
+    for force_n in np.arange(0.0, 35.0, 0.01):  # 2 N/s
+        arm.feels(0.0, 0.0, float(force_n), s=PERIOD_S)
+    load = arm.contact.touching()
+    assert load is not None
+    assert str(load) == f"contact_force {force_n:.1f} N"
+    assert load.value < 0.7 * force_n
+
+
 def test_a_free_arm_has_all_its_speed() -> None:
     arm = active()
     arm.feels(0.5, -1.0, 0.5)

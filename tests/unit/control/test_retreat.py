@@ -400,6 +400,7 @@ def test_an_arm_that_is_to_stand_says_what_presses_on_it_and_stays(end: str) -> 
     np.testing.assert_allclose(rig.commands[-1].position_m, stood_m, atol=1e-6)
     (why,) = pressed(rig)
     assert why.endswith("it stays there")
+    assert float(why.split()[1]) == pytest.approx(np.linalg.norm(rig.force_n), abs=0.3)
 
 
 def test_an_arm_that_holds_says_what_presses_and_retreats_when_it_gives_up() -> None:
