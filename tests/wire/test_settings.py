@@ -109,6 +109,15 @@ def test_what_is_refused_changes_nothing_and_is_said(chain: Chain) -> None:
     assert "neither true nor false" in said["active"]
 
 
+@pytest.mark.parametrize("text", ['"false"', "0.0", '{"active": false}', "null", "x" * 10_000])
+def test_what_is_no_clear_activation_ends_one_and_is_said(chain: Chain, text: str) -> None:
+    chain.activate_when_ready()
+    chain.client.pop_events()
+    chain.client.publish(chain.client.keys.active, text)
+    chain.until("it ends", lambda: chain.state() == "inactive")
+    chain.until("it is said", lambda: chain.events("invalid") or chain.events("oversize"))
+
+
 def test_a_second_command_node_refuses_to_start(chain: Chain) -> None:
     done = command_line("node", "command", profile=chain.profile_file)
     assert done.returncode == 1

@@ -145,6 +145,8 @@ class CommandInputs:
                 put.append(Setting(name, put_ns=put_ns))
                 continue
             value = self._node.decode_text(decode, arrival)
+            if value is None and name == "active":
+                value = False  # whoever wrote `False.` or JSON meant the arm to stop
             if value is not None:
                 put.append(Setting(name, value, put_ns, part))
         return put
