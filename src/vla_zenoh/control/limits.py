@@ -35,7 +35,7 @@ BEGIN_M, BEGIN_RAD = 0.002, 0.01
 BEGIN_JOINT = JointBound(0.004, BEGIN_M)
 """A command stream begins this near to where the robot holds the arm, or its guard rejects it: what
 it begins with is one step of the controller's set-point."""
-LEAST_TO_GOAL = 0.02
+LEAST_TO_GOAL = 1e-4
 """Least share where the joints are too slow, or a far target is approached."""
 
 

@@ -23,6 +23,7 @@ from vla_zenoh.control.limits import (
 from vla_zenoh.control.plan_timeline import JointGoal, joint_goal
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.step_space import JointSteps
+from vla_zenoh.kinematics.so3 import angle_between
 from vla_zenoh.types import FloatArray, Header, JointState, Stamped
 
 BOX = workspace_corners(panda().limits)
@@ -404,3 +405,26 @@ def test_the_share_of_a_long_way_keeps_the_tcp_within_its_speed_along_each_axis_
     twists = np.array([path.kinematics.jacobian(place) @ rates_rad_s for place in places])
     fastest_m_s = np.abs(twists[:, :3]).max()
     assert 0.9 * slow["velocity_m_s"] < fastest_m_s <= slow["velocity_m_s"]
+
+
+@pytest.mark.parametrize(
+    ("velocity_m_s", "velocity_rad_s"), [(0.001, 1.5), (0.005, 1.5), (0.03, 1.5), (0.25, 0.005)]
+)
+def test_joints_are_as_slow_as_the_tcp_may_be_however_slow_that_is(
+    velocity_m_s: float, velocity_rad_s: float
+) -> None:
+    slow = {
+        "translation": {"velocity_m_s": velocity_m_s},
+        "rotation": {"velocity_rad_s": velocity_rad_s},
+    }
+    arm = Joints(panda(limits=slow))
+    arm.activate()
+    ramp_rad = arm.home_rad + 0.3 * np.linspace(0.0, 4.0, 41)[:, None] * np.eye(7)[0]
+    arm.follow(ramp_rad)
+    poses = [arm.kinematics.forward(command.position_rad) for command in arm.joints]
+    period_s = arm.rig.period_ns / 1e9
+    pairs = list(pairwise(poses))
+    moved_m = np.array([after.position_m - before.position_m for before, after in pairs])
+    turned_rad = [angle_between(before.rotation, after.rotation) for before, after in pairs]
+    shares = np.abs(moved_m).max() / velocity_m_s, max(turned_rad) / velocity_rad_s
+    assert 0.5 < max(shares) / period_s < 1.001
