@@ -32,8 +32,10 @@ STARTS, DOWNHILL = 8, 15
 """Samples from which a pair that is not near in any of them is moved nearer, in so many steps."""
 DOWNHILL_RAD = 0.4
 """Longest of these steps; it is as long as the distance needs if its slope stays the same."""
-NEIGHBOURS_M = 0.03
-"""Links that are never further apart are neighbours: they touch at a joint."""
+NEIGHBOURS_M, NEIGHBOURS_SHARE = 0.03, 0.03
+"""Links that are never further apart are neighbours: they touch at a joint. Where other links are
+between them, not by more than this share of the arm's length either: in an arm of 15 cm two links
+that can touch are never 30 mm apart."""
 CONSTANT_M = 1e-3
 """A distance that varies by less over the joint space depends on no joint."""
 THINNEST_M = 1e-5
@@ -123,7 +125,7 @@ class CollisionModel:
         distances = self._at(samples_rad, pairs)
         nearest_m, farthest_m = distances.min(axis=0), distances.max(axis=0)
         to_links = np.array([second < self._links for _, second in pairs], bool)
-        neighbours = to_links & (farthest_m <= NEIGHBOURS_M)
+        neighbours = to_links & (farthest_m <= self._neighbours_m(pairs, kinematics))
         constant = farthest_m - nearest_m < CONSTANT_M
         allowed = _allowed([shape.name for shape in shapes], may_touch)
         told = np.array([{shapes[a].name, shapes[b].name} in allowed for a, b in pairs], bool)
@@ -142,6 +144,18 @@ class CollisionModel:
         self.pairs = tuple(self._pair(*pair) for pair in [*self._pairs, *self._held_pairs])
         self.farthest_m = np.full(len(self.pairs), np.inf)
         self.farthest_m[: len(used)] = farthest_m[wanted]
+
+    def _neighbours_m(
+        self, pairs: Sequence[tuple[int, int]], kinematics: Kinematics
+    ) -> FloatArray:
+        """(len(pairs),) `NEIGHBOURS_M` of two links, which may have others between them."""
+        joints = [int(shape.parentJoint) for shape in self._geometry.geometryObjects]
+        parents = [int(parent) for parent in self._model.parents]
+        apart_m = min(NEIGHBOURS_M, NEIGHBOURS_SHARE * kinematics.length_m)
+        joined = [
+            parents[joints[a]] == joints[b] or parents[joints[b]] == joints[a] for a, b in pairs
+        ]
+        return np.where(joined, NEIGHBOURS_M, apart_m)
 
     def tcp_beyond_m(self, kinematics: Kinematics) -> float:
         """Distance of the TCP from the shapes that move with it, inf without any."""

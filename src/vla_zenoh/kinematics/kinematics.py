@@ -159,6 +159,12 @@ class Kinematics:
         placement = self.model.frames[self.tcp].placement
         return placement.rotation.T @ placement.translation
 
+    @property
+    def length_m(self) -> float:
+        """Length of the chain from the first joint to the TCP, slides at zero."""
+        ways_m = [placement.translation for placement in list(self.model.jointPlacements)[2:]]
+        return sum(float(np.linalg.norm(way_m)) for way_m in [*ways_m, self.tool_m])
+
     # -- joints -------------------------------------------------------------------------------
     @property
     def sampled_rad(self) -> tuple[FloatArray, FloatArray]:

@@ -48,6 +48,19 @@ def test_the_hand_is_what_moves_with_the_tcp_whichever_joint_comes_last(tmp_path
     assert hand == {"j7_link", "tcp", HELD}
 
 
+@pytest.mark.parametrize("size", [0.3, 0.15, 0.07])
+def test_a_small_arm_has_the_pairs_of_a_large_one(tmp_path: Path, size: float) -> None:
+    def pairs(size: float) -> set[str]:
+        rows = [*arm(SEVEN), TOOL]
+        made = [row._replace(at_m=tuple(size * each for each in row.at_m)) for row in rows]
+        path = tmp_path / f"{size}.urdf"
+        path.write_text(urdf(made).replace('radius="0.02"', f'radius="{0.02 * size}"'))
+        found = CollisionModel(Kinematics(path, "tcp", JOINTS), near_m=1.0).pairs
+        return {str(pair) for pair in found}
+
+    assert pairs(1.0) <= pairs(size)
+
+
 @pytest.mark.parametrize(("slides_m", "checked"), [(0.0015, True), (0.0005, False)])
 def test_a_distance_that_a_joint_changes_by_more_than_a_millimetre_is_checked(
     tmp_path: Path, slides_m: float, checked: bool
