@@ -331,9 +331,8 @@ class CommandedPart:
         retreats = self._relieves and not stays and not self.keeps_from_retreat(part)
         if retreats and part.commanded is not None:
             self.retreat.begin(part.commanded)
-        why = (
-            f"{load} presses on the arm where it came to rest; "
-            + ("it retreats" if self.retreat.busy else "it stays there")
+        why = f"{load} presses on the arm where it came to rest; " + (
+            "it retreats" if self.retreat.busy else "it stays there"
         )
         return make_event("warning", "notice", "pressed", why, load.most, load.slow)
 

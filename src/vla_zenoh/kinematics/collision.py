@@ -145,9 +145,7 @@ class CollisionModel:
         self.farthest_m = np.full(len(self.pairs), np.inf)
         self.farthest_m[: len(used)] = farthest_m[wanted]
 
-    def _neighbours_m(
-        self, pairs: Sequence[tuple[int, int]], kinematics: Kinematics
-    ) -> FloatArray:
+    def _neighbours_m(self, pairs: Sequence[tuple[int, int]], kinematics: Kinematics) -> FloatArray:
         """(len(pairs),) `NEIGHBOURS_M` of two links, which may have others between them."""
         joints = [int(shape.parentJoint) for shape in self._geometry.geometryObjects]
         parents = [int(parent) for parent in self._model.parents]

@@ -25,6 +25,8 @@ PERIOD_NS = 200_000_000
 START_NS = 1_700_000_000_000_000_000
 MAX_WIDTH_M = 0.08
 HOME_M, DOWN_XYZW = (0.43, 0.0, 0.16), (1.0, 0.0, 0.0, 0.0)
+TILTED_XYZW = (0.9, 0.3, 0.1, 0.3)
+"""Where the tool points straight down, rows and columns of a rotation are the same."""
 
 Picture = NDArray[np.uint8]
 
@@ -73,6 +75,7 @@ class ExampleStyle:
     picture: Callable[[int, int], Picture] = chart
     prompt: str = PROMPTS[0]
     position_m: tuple[float, float, float] = HOME_M
+    quat_xyzw: tuple[float, float, float, float] = DOWN_XYZW
     width_m: float = MAX_WIDTH_M
     holding: bool = False
     swapped: bool = False
@@ -92,6 +95,7 @@ def example_styles(prompts: Sequence[str] = PROMPTS) -> list[ExampleStyle]:
         ExampleStyle("something held", prompt=first, width_m=0.03, holding=True),
         ExampleStyle("gripper shut", prompt=first, width_m=0.0, position_m=(0.5, 0.2, 0.02)),
         ExampleStyle("far corner", prompt=first, position_m=(0.75, -0.45, 0.6)),
+        ExampleStyle("tool tilted", prompt=first, quat_xyzw=TILTED_XYZW),
         ExampleStyle("white pictures", picture=plain(255), prompt=first),
         ExampleStyle("not obeyed", prompt=first, active=False),
     ]
@@ -179,7 +183,7 @@ class ExampleMaker:
         joint = self._joint(part)
         state: dict[str, Any] = {
             "joint": joint,
-            "pose": PoseState(np.array(style.position_m), np.array(DOWN_XYZW), np.zeros(6)),
+            "pose": PoseState(np.array(style.position_m), np.array(style.quat_xyzw), np.zeros(6)),
             "gripper": self._gripper(style, part),
             "wrench": np.zeros(6),
             "effort": joint.effort_nm,

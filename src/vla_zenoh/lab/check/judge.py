@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,12 @@ from numpy.typing import NDArray
 
 from vla_zenoh.control.policy_check import Finding, error
 from vla_zenoh.errors import SpecError
+from vla_zenoh.kinematics.so3 import angle_between, rotation_from_quat
 from vla_zenoh.lab.check.examples import MAX_WIDTH_M, ExampleStyle
 from vla_zenoh.lab.check.fit import note, warning
 from vla_zenoh.policy import ActionSpec, ActionSteps, Observation, Policy, check_steps
+from vla_zenoh.policy.meaning import ROTATION_FORMS, RotationForm
+from vla_zenoh.types import FloatArray
 
 GROWTH_KIB, GROWTH_TOTAL_KIB = 32.0, 4096.0
 """Growth per inference, and in all, above which it is a leak."""
@@ -70,7 +74,7 @@ def behaviour(
     Args:
         depends_on: pictures, colour order, prompt -> the answer depends on it; None: unknown.
     """
-    found = _polarity(action, answers)
+    found = [*_polarity(action, answers), *_rotation_form(action, answers)]
     # The first three numbers of every rotation, x, y, z of a quaternion too, are zero for none.
     size = action.arm_size if action.space == "joint" else 6
     moves = any(np.any(np.abs(steps[:, :size]) > ALIKE) for _, steps in answers)
@@ -111,6 +115,47 @@ def _polarity(action: ActionSpec, answers: Answers) -> list[Finding]:
             f"gripper_open_is_high: {action.gripper_open_is_high} right?",
         )
     ]
+
+
+FAR_RAD, SAME_RAD = 0.5, 0.2
+"""Targets further turned from the tool than the first, and nearer than the second if their numbers
+are read in another form."""
+
+
+def _rotation_form(action: ActionSpec, answers: Answers) -> Iterator[Finding]:
+    """Targets turn the tool far in some example, and in none if they are of another form."""
+    for part in [each.part for each in action.parts] or [""]:
+        own, columns = action.of(part), action.columns(part)
+        if own.kind != "absolute" or own.space == "joint":
+            continue
+        numbers = [steps[0, columns][own.rotation_columns].tolist() for _, steps in answers]
+        here = [rotation_from_quat(np.array(style.quat_xyzw)) for style, _ in answers]
+        turns_rad = {
+            name: _furthest_rad(form, numbers, here)
+            for name, form in ROTATION_FORMS.items()
+            if form.size == own.rotation_form.size
+        }
+        given_rad = turns_rad.pop(own.rotation)
+        for name, other_rad in turns_rad.items():
+            if given_rad > FAR_RAD and other_rad < SAME_RAD:
+                why = f"the tool is to turn by up to {given_rad:.2f} rad at once, and would by "
+                why += f"{other_rad:.2f} if its numbers are {name}; declared are {own.rotation}"
+                names = ", ".join(own.rotation_form.names)
+                yield error(own.rotation, f"{why} ({names})")
+
+
+def _furthest_rad(
+    form: RotationForm, numbers: Sequence[Sequence[float]], here: Sequence[FloatArray]
+) -> float:
+    """Largest angle from rotations (3, 3) to those that the numbers are in this form."""
+    angles = [0.0]
+    for written, rotation in zip(numbers, here, strict=True):
+        try:
+            quat_xyzw = np.array(form.decode(written))
+        except SpecError:
+            return math.inf
+        angles.append(angle_between(rotation, rotation_from_quat(quat_xyzw)))
+    return max(angles)
 
 
 NEAR = 1e-3
