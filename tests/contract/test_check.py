@@ -368,7 +368,8 @@ def test_numbers_that_may_be_no_rotation_are_findings(
         ([0.05, 0.0, 0.0, 0.0, 0.0, 0.0], set()),
         ([0.06, 0.0, 0.0, 0.0, 0.0, 0.0], {("warning", "step_limit"), ("warning", "speed_limit")}),
         ([0.21, 0.0, 0.0, 0.0, 0.0, 0.0], {("error", "position_units")}),
-        ([0.0, 0.0, 0.0, 0.0, 0.0, 0.14], set()),
+        ([0.0, 0.0, 0.0, 0.0, 0.0, 0.08], set()),
+        ([0.0, 0.0, 0.0, 0.0, 0.0, 0.12], {("warning", "speed_limit")}),
         ([0.0, 0.0, 0.0, 0.0, 0.0, 0.81], {("error", "rotation_units")}),
     ],
 )

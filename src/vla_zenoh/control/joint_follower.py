@@ -151,7 +151,7 @@ class JointFollower:
         constraints: distances to keep; None: none.
         acceleration_rad_s2: greatest of every joint, one number or (n,).
         jerk_rad_s3: greatest of every joint; the default has no noticeable effect.
-        velocity_share: part of the URDF's joint velocities that is used.
+        velocity_rad_s: greatest of every joint, (n,); None: those of the URDF.
         margin_rad: kept from both ends of every joint's range, one number or (n,).
         singularity_stop: s_stop, below which the arm does not go by itself.
         lead: m and rad from the TCP to the furthest target that is followed as it is.
@@ -165,7 +165,7 @@ class JointFollower:
         *,
         acceleration_rad_s2: float | FloatArray = 10.0,
         jerk_rad_s3: float | FloatArray = 1e6,
-        velocity_share: float = 1.0,
+        velocity_rad_s: FloatArray | None = None,
         margin_rad: float | FloatArray = 0.05,
         singularity_stop: float = 0.015,
         lead: tuple[float, float] = (math.inf, math.inf),
@@ -176,7 +176,9 @@ class JointFollower:
         self.jerk_rad_s3 = np.full(kinematics.size, jerk_rad_s3)
         self._ramp_s = float(np.max(self.acceleration_rad_s2 / self.jerk_rad_s3))
         self._back_1_s = BACK_JERK / self._ramp_s
-        self.velocity_rad_s = velocity_share * kinematics.velocity_rad_s
+        self.velocity_rad_s = (
+            kinematics.velocity_rad_s if velocity_rad_s is None else velocity_rad_s
+        )
         self.lower_rad = kinematics.lower_rad + margin_rad
         self.upper_rad = kinematics.upper_rad - margin_rad
         self._singularity_stop, self._lead = singularity_stop, lead

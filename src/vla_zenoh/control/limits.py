@@ -90,15 +90,12 @@ def joint_motion_limits(profile: Profile, margin: float = 1.0) -> JointMotionLim
 
 
 def chain_motion_limits(profile: Profile, kinematics: Kinematics) -> JointMotionLimits:
-    """The same in chain order; the velocities are one share of the URDF's, at most all of them."""
+    """The same in chain order; the velocities are those of the URDF at most."""
     velocity, acceleration, jerk = (
         kinematics.ordered(profile.robot.arm_joints, values)
         for values in joint_motion_limits(profile)
     )
-    share = min(float(np.min(velocity / kinematics.velocity_rad_s)), 1.0)
-    return JointMotionLimits(
-        np.minimum(velocity, share * kinematics.velocity_rad_s), acceleration, jerk
-    )
+    return JointMotionLimits(np.minimum(velocity, kinematics.velocity_rad_s), acceleration, jerk)
 
 
 def stop_way(

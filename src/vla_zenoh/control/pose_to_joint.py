@@ -88,7 +88,6 @@ class PoseToJoint:
         self._kinematics = kinematics
         self.limits = chain_motion_limits(profile, kinematics)
         velocity, acceleration, jerk = self.limits
-        share = float(np.min(velocity / kinematics.velocity_rad_s))
         home_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
         self._home_rad = home_rad if robot.posture == "home" else None
         self._bounds = limits
@@ -99,7 +98,7 @@ class PoseToJoint:
             self._constraints,
             acceleration_rad_s2=acceleration,
             jerk_rad_s3=jerk,
-            velocity_share=share,
+            velocity_rad_s=velocity,
             margin_rad=joint_margins(limits.reach, kinematics),
             singularity_stop=limits.reach.singularity_stop,
             lead=(limits.lead_m, limits.lead_rad),

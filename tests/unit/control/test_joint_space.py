@@ -11,7 +11,7 @@ from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
 from vla_zenoh.control.axis_smoothing import AxisState
-from vla_zenoh.control.commander_io import StateHistory
+from vla_zenoh.control.commander_io import Setting, StateHistory
 from vla_zenoh.control.joint_space import STEP_HALVINGS, JointBounds, JointPath
 from vla_zenoh.control.limits import (
     PAUSE_LEAD_RAD,
@@ -428,3 +428,26 @@ def test_joints_are_as_slow_as_the_tcp_may_be_however_slow_that_is(
     turned_rad = [angle_between(before.rotation, after.rotation) for before, after in pairs]
     shares = np.abs(moved_m).max() / velocity_m_s, max(turned_rad) / velocity_rad_s
     assert 0.5 < max(shares) / period_s < 1.001
+
+
+@pytest.mark.parametrize("space", ["joint", "tcp"])
+def test_a_joint_that_may_only_be_slow_slows_no_other(space: str) -> None:
+    def fastest_rad_s(slow_rad_s: float) -> FloatArray:
+        limits = {"joint": {"velocity_rad_s": [slow_rad_s, *[1.0] * 6]}}
+        more = {} if space == "joint" else {"joints": (), "kind": "delta", "rotation": "rotvec"}
+        arm = Joints(panda(limits=limits), space=space, **more)
+        if space == "joint":
+            arm.activate()
+            arm.follow(arm.home_rad + np.linspace(0.0, 2.0, 21)[:, None] * np.eye(7)[6])
+        else:  # the wrist's last joint turns the tool about its own axis
+            arm.send([0.0] * 6)
+            arm.tick(Setting("active", True))
+            for _ in range(5):
+                arm.send(*[[0.0, 0.0, 0.0, 0.0, 0.0, 0.07]] * 8)
+                arm.run(0.4)
+        return np.abs([command.velocity_rad_s for command in arm.joints]).max(axis=0)
+
+    free, slowed = fastest_rad_s(1.0), fastest_rad_s(0.05)
+    assert free[6] > 0.5
+    assert slowed[6] == pytest.approx(free[6], rel=0.02)
+    assert slowed[0] <= 0.05 + 1e-9

@@ -276,7 +276,7 @@ def test_a_far_target_at_rest_is_reached_without_overshoot() -> None:
 
 
 def test_a_share_of_the_velocity_limits_is_kept() -> None:
-    follower = JointFollower(KINEMATICS, HOME_RAD, velocity_share=0.1)
+    follower = JointFollower(KINEMATICS, HOME_RAD, velocity_rad_s=0.1 * KINEMATICS.velocity_rad_s)
     run = follow([moved(KINEMATICS.forward(HOME_RAD), [0, 0, 0.4], [0, 0, 0])], 500, follower)
     assert np.abs(run.velocity_rad_s).max() <= 0.261 * OVER_LIMIT
     assert "joint_velocity" in run.hits

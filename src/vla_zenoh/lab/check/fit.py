@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.control.actions import chunk_poses
+from vla_zenoh.control.limits import ROTATION_BOX
 from vla_zenoh.control.policy_check import (
     Finding,
     Steps,
@@ -224,9 +225,10 @@ def _steps(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding]:
         poses = [ORIGIN, *chunk_poses(spec, steps, ORIGIN)]
         ways = [pose_distance(before, after) for before, after in pairwise(poses)]
         longest_m, most_rad = map(max, zip(*ways, strict=True))
-    for step, unit, most, speed in (
-        (longest_m, "m", limits.step_m, limits.translation.velocity_m_s),
-        (most_rad, "rad", limits.step_rad, limits.rotation.velocity_rad_s),
+    turn_rad_s = ROTATION_BOX * limits.rotation.velocity_rad_s
+    for step, unit, most, speed, where in (
+        (longest_m, "m", limits.step_m, limits.translation.velocity_m_s, ""),
+        (most_rad, "rad", limits.step_rad, turn_rad_s, " about an axis of the base"),
     ):
         if step > REJECT_FACTOR * most:
             continue  # an error
@@ -238,5 +240,5 @@ def _steps(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding]:
             yield warning(
                 "speed_limit",
                 f"a step of {step:.4g} in {spec.dt_s:g} s is {step / spec.dt_s:.3g} {unit}/s, the "
-                f"limit is {speed:g}: the arm will come later than asked",
+                f"limit is {speed:g}{where}: the arm will come later than asked",
             )
