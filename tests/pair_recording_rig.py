@@ -23,7 +23,7 @@ from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.load import to_yaml
 from vla_zenoh.types import (
     ActionChunk,
@@ -37,7 +37,6 @@ from vla_zenoh.types import (
 )
 
 KEYS = Keys("pair")
-PROFILE = to_yaml(load_profile("two_pandas_sim"))
 JOINTS = ("joint1", "joint2")
 BEGIN_MS, END_MS = 500, 500 + CHUNK_MS * CHUNKS
 SPEED_M_S = {"left": 0.1, "right": 0.2}
@@ -47,14 +46,19 @@ PROMPT = "lift the bar"
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def pair_spec(**action: object) -> ModelSpec:
-    """Two joints and a gripper of each part."""
+def pair_spec(bare: str = "", **action: object) -> ModelSpec:
+    """Two joints and a gripper of each part, but for the one that is `bare`."""
     fields = {"space": "joint", "joints": JOINTS, "kind": "absolute", "gripper": "absolute_m"}
     own = ActionSpec(horizon=HORIZON, dt_s=DT_S, **{**fields, **action})  # pyright: ignore
     return ModelSpec(
         name="pair_model",
         observation=ObservationSpec(state=("joint", "gripper"), prompt=True),
-        action=ActionSpec.of_parts({"left": own, "right": own}),
+        action=ActionSpec.of_parts(
+            {
+                part: own.model_copy(update={"gripper": "none"}) if part == bare else own
+                for part in ("left", "right")
+            }
+        ),
     )
 
 
@@ -63,9 +67,13 @@ def joints_rad(part: str, at_ms: float) -> np.ndarray:
     return np.array([SPEED_M_S[part], -SPEED_M_S[part]]) * at_ms / 1e3
 
 
-def write_pair_run(path: Path, *, of: ModelSpec | None = None, silent: Sequence[int] = ()) -> Path:
-    """One activation; chunks in `silent` were never published."""
-    spec = of or pair_spec()
+def write_pair_run(
+    path: Path, *, of: ModelSpec | None = None, silent: Sequence[int] = (), bare: str = ""
+) -> Path:
+    """One activation; chunks in `silent` were never published, part `bare` has no gripper."""
+    spec = of or pair_spec(bare)
+    without = {"parts": {bare: {"robot": {"gripper": None, "finger_joints": []}}}} if bare else {}
+    profile_yaml = to_yaml(override(load_profile("two_pandas_sim"), without))
     samples = [put(KEYS.spec("pair_model"), spec, 0, 0)]
     for at_ms in range(BEGIN_MS, END_MS, 100):
         task = Task(1, True, PROMPT, "pair_model", 5.0)
@@ -101,14 +109,18 @@ def write_pair_run(path: Path, *, of: ModelSpec | None = None, silent: Sequence[
             states = {
                 keys.state_pose: PoseState(place, DOWN, twist),
                 keys.state_joint: JointState(JOINTS, joints_rad(part, at_ms), still, still),
-                keys.state_gripper: GripperState(WIDTH_M[part], False, False),
+                keys.state_gripper: GripperState(
+                    None if part == bare else WIDTH_M[part], False, False
+                ),
             }
             samples += [put(key, state, at_ms, at_ms) for key, state in states.items()]
     for number in range((END_MS + 500) // 50):
         at_ns = ZERO_NS + 50 * number * MS
         header = Header(at_ns, number, "camera#1")
         samples.append(Sample(KEYS.camera_jpeg("front"), picture(number), JPEG, header, at_ns + MS))
-    out = RecordingWriter(path, KEYS, profile_yaml=PROFILE, base_frame="base", began_ns=ZERO_NS)
+    out = RecordingWriter(
+        path, KEYS, profile_yaml=profile_yaml, base_frame="base", began_ns=ZERO_NS
+    )
     for sample in sorted(samples, key=lambda each: each.received_ns):
         out.write(sample)
     out.finish({"dropped": {}})

@@ -58,7 +58,13 @@ from vla_zenoh_model_lerobot.mapping import (
 )
 from vla_zenoh_model_lerobot.normalisation import IDENTITY, Scaled, check_statistics
 from vla_zenoh_policy_servers.action_semantics import ActionSemantics, read_action_semantics
-from vla_zenoh_policy_servers.state_vector import StateNumbers, parts_of, state_numbers
+from vla_zenoh_policy_servers.state_vector import (
+    StateNumbers,
+    names_of_part,
+    only_others_grip,
+    parts_of,
+    state_numbers,
+)
 
 from vla_zenoh.errors import SpecError, WorkerError, in_words
 from vla_zenoh.policy import (
@@ -127,7 +133,12 @@ class LeRobot:
         arms = {name: robot.of_part(name) for name in arm_names(parts, tuple(robot.parts))}
         told = {**meaning, "horizon": str(steps)}
         self._meaning: dict[str, ActionSemantics] = {
-            name: read_action_semantics(told, known, "the data set", joints=arm.robot.arm_joints)
+            name: read_action_semantics(
+                {**told, "gripper": "none"} if only_others_grip(name, arms) else told,
+                known,
+                "the data set",
+                joints=arm.robot.arm_joints,
+            )
             for name, arm in arms.items()
         }
         inputs = features(self._folder, config, "input_features")
@@ -135,7 +146,9 @@ class LeRobot:
         joints = [len(arm.robot.arm_joints) for arm in arms.values()]
         names = state_parts(self._folder, kind, inputs, state, joints)
         self._state: dict[str, StateNumbers] = {
-            name: state_numbers(names, arm, self._meaning[name].state_units)
+            name: state_numbers(
+                names_of_part(names, name, arms), arm, self._meaning[name].state_units
+            )
             for name, arm in arms.items()
             if names
         }

@@ -91,6 +91,21 @@ def test_columns_of_a_dataset_have_the_names_of_lerobots_robots_with_two_arms(
     assert features["observation.state"]["names"] == NAMES
 
 
+@pytest.mark.parametrize("bare", ["left", "right"])
+@pytest.mark.parametrize("state", ["", "joint+gripper_m"])
+def test_a_part_without_a_gripper_has_no_columns_of_one(
+    tmp_path: Path, bare: str, state: str
+) -> None:
+    episodes = episodes_of(load_run(write_pair_run(tmp_path / "pair.mcap", bare=bare)))
+    export(tmp_path / "out", episodes, ["front"], read_parts(state or usual_state(episodes)))
+    features = json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
+    for feature, count in (("action", 5), ("observation.state", 5)):
+        names = features[feature]["names"]
+        assert len(names) == count
+        assert [name for name in names if "gripper" in name and name.startswith(bare)] == []
+        assert len([name for name in names if "gripper" in name]) == 1
+
+
 def test_actions_and_states_of_each_part_are_in_the_numbers_of_lerobots_robots(
     dataset: Path,
 ) -> None:

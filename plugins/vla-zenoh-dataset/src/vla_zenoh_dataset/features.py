@@ -23,6 +23,7 @@ from vla_zenoh_policy_servers.presets import LEROBOT, LEROBOT_STATE
 from vla_zenoh_policy_servers.state_vector import (
     PARTS,
     StateNumbers,
+    names_of_part,
     parts_of,
     state_numbers,
 )
@@ -266,14 +267,15 @@ def usual_state(episodes: Sequence[RecordedEpisode]) -> str:
     """Parts of the state that go with the actions: joints with joints, else the pose."""
     if not episodes:
         return "position+rpy+gripper_m"
-    part = episodes[0].spec.parts[0]
-    first = episodes[0].spec.action.of(part)
-    gripper = "+gripper_m" if episodes[0].run.of_part(part).profile.robot.gripper else ""
-    if first.space != "joint":
+    run, parts = episodes[0].run, episodes[0].spec.parts
+    actions = [episodes[0].spec.action.of(part) for part in parts]
+    grips = any(run.of_part(part).profile.robot.gripper for part in parts)
+    gripper = "+gripper_m" if grips else ""
+    if actions[0].space != "joint":
         return f"position+rpy{gripper}"
-    if not in_lerobots_numbers(first):
+    if not in_lerobots_numbers(actions[0]):
         return f"joint{gripper}"
-    return LEROBOT_STATE if first.gripper != "none" else "joint"
+    return LEROBOT_STATE if any(each.gripper != "none" for each in actions) else "joint"
 
 
 def actions_of(episode: RecordedEpisode) -> NDArray[np.float32]:
@@ -326,9 +328,11 @@ def numbers_of(episode: RecordedEpisode, parts: Sequence[str]) -> dict[str, Stat
         RecordingError: the recording holds no profile.
     """
     out: dict[str, StateNumbers] = {}
-    for part in episode.spec.parts:
-        run, spec = episode.run.of_part(part), episode.spec.action.of(part)
-        own = state_numbers(parts, run.profile, semantics_of(spec, run.profile).state_units)
+    runs = {part: episode.run.of_part(part) for part in episode.spec.parts}
+    arms = {part: run.profile for part, run in runs.items()}
+    for part, run in runs.items():
+        units = semantics_of(episode.spec.action.of(part), run.profile).state_units
+        own = state_numbers(names_of_part(parts, part, arms), run.profile, units)
         recorded = run.joints[0].record.names if run.joints else own.joints
         known = set(own.joints) <= set(recorded)
         out[part] = own if known else replace(own, joints=recorded)

@@ -273,6 +273,18 @@ class StateNumbers:
         return GripperScale(1.0, 0.0) if gripper == "gripper_closed" else self.units.gripper
 
 
+def only_others_grip(part: str, arms: Mapping[str, Profile]) -> bool:
+    """Whether this one of several arms has no gripper, and another has one."""
+    without = [name for name, arm in arms.items() if arm.robot.no_gripper]
+    return part in without and len(without) < len(arms)
+
+
+def names_of_part(names: Sequence[str], part: str, arms: Mapping[str, Profile]) -> list[str]:
+    """The names of the state of one of several arms: those of a gripper only where it has one."""
+    bare = only_others_grip(part, arms)
+    return [name for name in names if not (bare and name in GRIPPERS)]
+
+
 def state_numbers(
     names: Sequence[str], profile: Profile, units: StateUnits = METRIC
 ) -> StateNumbers:
