@@ -323,9 +323,23 @@ MAX_WIDTH_M = 0.08
 DOWN_XYZW = [1.0, 0.0, 0.0, 0.0]
 
 
-def found_in(action: ActionSpec, row: list[float]) -> set[tuple[str, str]]:
+def found_in(
+    action: ActionSpec, row: list[float], max_width_m: float = MAX_WIDTH_M
+) -> set[tuple[str, str]]:
     steps = check_steps(action, [row])
-    return {f[:2] for f in fit.check_chunk(action, steps, Limits(), MAX_WIDTH_M)}
+    return {f[:2] for f in fit.check_chunk(action, steps, Limits(), max_width_m)}
+
+
+@pytest.mark.parametrize(
+    ("max_width_m", "width_m", "fits"),
+    [(0.08, 0.1, True), (0.08, 0.14, False), (0.01, 0.015, True), (0.01, 0.045, False)],
+)
+def test_a_width_far_beyond_the_gripper_is_in_another_unit_however_small_that_is(
+    max_width_m: float, width_m: float, fits: bool
+) -> None:
+    action = ActionSpec(horizon=1, dt_s=0.1, gripper="absolute_m")
+    found = found_in(action, [0.0] * 6 + [width_m], max_width_m)
+    assert found == (set() if fits else {("error", "gripper_range")})
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,9 @@ from typer.testing import CliRunner
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.lab.profile.robot_check import singular_advice
 from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.profile import load_profile, override
+from vla_zenoh.profile import ReachLimits, load_profile, override
 from vla_zenoh.program.main import app
 from vla_zenoh.simulation.scene import POSES, PREFIX, TCP_SITE
 from vla_zenoh.simulation.world import World, build_world
@@ -85,6 +86,25 @@ AT_ONCE = {"a torso that lifts", "knuckles that turn against each other"}
 def test_a_made_profile_moves_its_simulated_arm(tmp_path: Path, name: str) -> None:
     code, output, file = new(tmp_path, urdf(TAKEN[name].rows))
     assert code == 0, output
+    why, ways_m = moved_m(file)
+    assert why == ""
+    assert ways_m == pytest.approx([WAY_M, -WAY_M], abs=EXACT_M)
+
+
+@pytest.mark.parametrize("size", [0.3, 0.2])
+def test_a_small_arm_has_limits_of_its_size_and_moves(tmp_path: Path, size: float) -> None:
+    rows = [
+        row._replace(at_m=tuple(size * each for each in row.at_m))
+        for row in TAKEN["six joints"].rows
+    ]
+    shaped = urdf(rows).replace('radius="0.02"', f'radius="{0.02 * size}"')
+    code, output, file = new(tmp_path, shaped)
+    assert code == 0, output
+    assert "no home was found" not in output
+    profile = load_profile(str(file))
+    assert list(singular_advice(profile)) == []
+    reach, usual = profile.limits.reach, ReachLimits()
+    assert reach.collision_stop_m < usual.collision_stop_m
     why, ways_m = moved_m(file)
     assert why == ""
     assert ways_m == pytest.approx([WAY_M, -WAY_M], abs=EXACT_M)

@@ -49,8 +49,8 @@ FURTHEST_RAD = 4 * math.pi
 """No joint target is further from zero; one in degrees is."""
 GRIPPER_SLACK = 0.25
 """A fraction outside [0, 1] by up to this is rounding of a model, and clipped."""
-GRIPPER_SLACK_M = 0.05
-"""A width outside the gripper's range by up to this is clipped, too."""
+GRIPPER_SLACK_M, GRIPPER_SLACK_SHARE = 0.05, 0.7
+"""A width outside the gripper's range by up to this, or this share of it, is clipped, too."""
 NO_CUT = 1e-9
 """A translation or rotation that is shortened by less counts as complete."""
 
@@ -208,10 +208,11 @@ def with_quaternions(spec: ActionSpec, steps: FloatArray) -> tuple[ActionSpec, F
 
 def gripper_range(spec: ActionSpec, max_width_m: float) -> tuple[float, float]:
     """Least and greatest gripper number of the declared meaning; of a choice of two any is one."""
+    slack_m = min(GRIPPER_SLACK_M, GRIPPER_SLACK_SHARE * max_width_m)
     if spec.gripper == "delta_m":
-        return -max_width_m - GRIPPER_SLACK_M, max_width_m + GRIPPER_SLACK_M
+        return -max_width_m - slack_m, max_width_m + slack_m
     if spec.gripper == "absolute_m":
-        return -0.01, max_width_m + GRIPPER_SLACK_M
+        return -min(0.01, slack_m), max_width_m + slack_m
     if spec.gripper == "open_fraction":
         return -GRIPPER_SLACK, 1.0 + GRIPPER_SLACK
     return -math.inf, math.inf

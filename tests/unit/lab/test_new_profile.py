@@ -341,7 +341,7 @@ def test_the_picture_shows_every_joint_and_the_tcp_where_kinematics_has_it(tmp_p
     links, home = structure(Description(path), None, None), (0.3, 0.5, -0.4, 0.2, 0.6, 0.1)
     box = ((-0.5, 0.5), (-0.4, 0.4), (0.1, 0.9))
     still = JointMotion((), (), ())
-    drawn = Arm(path, links, Gripper(), Posture(home, box, 0.6, True), still, 0.0, [], [])
+    drawn = Arm(path, links, Gripper(), Posture(home, box, 0.6, True), still, 0.0, {}, [], [])
     root = ElementTree.fromstring(picture("a <b>", drawn))
     panels = [each for each in root if each.tag.endswith("}g")]
     tcp = Kinematics(path, "tcp", JOINTS_6, base_frame="base").forward(np.array(home)).position_m

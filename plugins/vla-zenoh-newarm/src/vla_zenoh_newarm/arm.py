@@ -14,7 +14,7 @@ from vla_zenoh.profile import ReachLimits
 from vla_zenoh_newarm.answers import Answers, Guess
 from vla_zenoh_newarm.gripper import Gripper, gripper
 from vla_zenoh_newarm.mended import Mended
-from vla_zenoh_newarm.posture import Posture, points_down, posture, tool_axis
+from vla_zenoh_newarm.posture import Posture, limits_of_size, points_down, posture, tool_axis
 from vla_zenoh_newarm.structure import Structure, structure
 
 VELOCITY_SHARE, FASTEST_RAD_S, FASTEST_M_S = 0.5, 1.0, 0.2
@@ -41,6 +41,7 @@ class Arm(NamedTuple):
         posture: its home and workspace.
         motion: limits of its joints.
         table_z_m: height of the table; None: there is none.
+        of_size: limits of `ReachLimits` that go by the size of the arm.
         changes: what was changed in the description, and what is unusual in it.
         guesses: what nobody has confirmed.
     """
@@ -51,6 +52,7 @@ class Arm(NamedTuple):
     posture: Posture
     motion: JointMotion
     table_z_m: float | None
+    of_size: Mapping[str, float]
     changes: Sequence[str]
     guesses: Sequence[Guess]
 
@@ -85,13 +87,17 @@ def found_arm(source: Path, copy: Path, arguments: Mapping[str, str], answers: A
         "table", [0.0], "limits.reach.table_z_m", "height of the table in the base frame, m", (1, 0)
     )
     table_z_m = heights[0] if heights else None
-    home = posture_of(kinematics, table_z_m, answers)
+    of_size = limits_of_size(kinematics)
+    home = posture_of(kinematics, ReachLimits(table_z_m=table_z_m, **of_size), answers)
+    for name in of_size:
+        what = f"by the size of the arm, {kinematics.length_m:.2f} m"
+        answers.guesses.append(Guess(f"limits.reach.{name}", what))
     motion = _motion(kinematics, answers)
     changes = [*description.changes, *([hand.why] if hand.why else [])]
     if kinematics.endless.any():
         endless = ", ".join(itertools.compress(kinematics.arm_joints, kinematics.endless))
         changes.append(f"{endless}: no end, counted over turns; joint_range_rad gives one")
-    return Arm(file, links, hand, home, motion, table_z_m, changes, answers.guesses)
+    return Arm(file, links, hand, home, motion, table_z_m, of_size, changes, answers.guesses)
 
 
 def _structure(description: Mended, answers: Answers) -> Structure:
@@ -129,9 +135,8 @@ def _gripper(file: Path, links: Structure, answers: Answers) -> Gripper:
     return found._replace(values=dict(zip(names, values, strict=True)))
 
 
-def posture_of(kinematics: Kinematics, table_z_m: float | None, answers: Answers) -> Posture:
+def posture_of(kinematics: Kinematics, reach: ReachLimits, answers: Answers) -> Posture:
     """Home and workspace: guessed, and then as the person wants them."""
-    reach = ReachLimits(table_z_m=table_z_m)
     given = answers.option("home")
     size = kinematics.size
     home: tuple[float, ...] = ()

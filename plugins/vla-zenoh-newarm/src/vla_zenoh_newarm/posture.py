@@ -10,6 +10,7 @@ import numpy as np
 from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.kinematics.kinematics import InverseKinematics, Kinematics, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose, exp3
+from vla_zenoh.lab.profile.robot_check import singularity_limits
 from vla_zenoh.profile import POSE_JOINTS, ReachLimits
 from vla_zenoh.profile.limits import REACH_M
 from vla_zenoh.simulation.robot_model import MIN_TOOL_M
@@ -40,6 +41,9 @@ FARTHEST_RAD = 3.0
 """Ranges beyond this, and joints without an end, are looked at up to here: half a turn has every
 direction."""
 
+SMALL_ARM_M = 0.45
+"""A shorter arm has distances of its own: its links are smaller."""
+
 Span = tuple[float, float]
 
 
@@ -59,6 +63,23 @@ class Posture(NamedTuple):
     reach_m: float
     free: bool
     may_touch: tuple[tuple[str, str], ...] = ()
+
+
+def _size(length_m: float) -> float:
+    """How small an arm of this length is; 1: it is not."""
+    return min(length_m / SMALL_ARM_M, 1.0)
+
+
+def limits_of_size(kinematics: Kinematics) -> dict[str, float]:
+    """Limits of `ReachLimits` by the size of the arm, where the usual ones are too large."""
+    usual, share = ReachLimits(), _size(kinematics.length_m)
+    found: dict[str, float] = {}
+    if (singularities := singularity_limits(kinematics, usual)) is not None:
+        _, found["singularity_slow"], found["singularity_stop"] = singularities
+    if share < 1.0:
+        for name in ("collision_slow_m", "collision_stop_m"):
+            found[name] = float(f"{share * getattr(usual, name):.1g}")
+    return found
 
 
 def posture(kinematics: Kinematics, reach: ReachLimits, home_rad: Sequence[float]) -> Posture:
@@ -83,9 +104,10 @@ def posture(kinematics: Kinematics, reach: ReachLimits, home_rad: Sequence[float
         inner = middle + INNER * half * shares
         home, free, touching = _home(kinematics, reach, inner, within, table_m, reach_m)
     at_m = kinematics.forward(home).position_m
+    margin_m = MARGIN_M * _size(kinematics.length_m)
     edges = np.quantile(places_m, (1 - REACH_SHARE, REACH_SHARE), axis=0)
-    lower = np.minimum(np.floor(edges[0] * 20) / 20, at_m - MARGIN_M)
-    upper = np.maximum(np.ceil(edges[1] * 20) / 20, at_m + MARGIN_M)
+    lower = np.minimum(np.floor(edges[0] * 20) / 20, at_m - margin_m)
+    upper = np.maximum(np.ceil(edges[1] * 20) / 20, at_m + margin_m)
     lower, upper = np.maximum(lower, -REACH_M), np.minimum(upper, REACH_M)
     if reach.table_z_m is not None:
         lower[2] = min(max(lower[2], table_m + ABOVE_M), float(at_m[2]) - ABOVE_M)
@@ -196,7 +218,8 @@ def _is_free(kinematics: Kinematics, barriers: Barriers, home_rad: FloatArray) -
     least = 0.5 * barriers.zone
     if np.any(barriers.at(home_rad, kinematics.jacobian(home_rad)) < barriers.zone):
         return False
-    for way_m in (WAY_M, -WAY_M):
+    up_m = WAY_M * _size(kinematics.length_m)
+    for way_m in (up_m, -up_m):
         goal = Pose(here.position_m + np.array([0.0, 0.0, way_m]), here.rotation)
         found = solver.approach(goal, home_rad)
         far = kinematics.size >= POSE_JOINTS and not found.solved

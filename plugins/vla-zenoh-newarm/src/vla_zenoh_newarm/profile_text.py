@@ -114,6 +114,10 @@ def profile_text(name: str, source: str, description: str, arm: Arm, drive: Driv
         f"    jerk_rad_s3: {_row(motion.jerk)}{mark(jerk)}",
         "  reach:",
         f"    table_z_m: {table}{mark('limits.reach.table_z_m')}",
+        *(
+            f"    {name}: {value:g}{mark(f'limits.reach.{name}')}"
+            for name, value in arm.of_size.items()
+        ),
         *_may_touch(home.may_touch),
         "",
         *_driven(drive, mark),

@@ -24,6 +24,7 @@ from vla_zenoh.lab.profile.robot_check import (
     joints_advice,
     mounts,
     simulator,
+    singular_advice,
     table_advice,
 )
 from vla_zenoh.policy.loader import find_worker, make_policy
@@ -93,6 +94,7 @@ def check_profile(
         *barriers_advice(profile),
         *table_advice(profile),
         *joints_advice(profile),
+        *singular_advice(profile),
         *braking_advice(profile),
     ]
     return ProfileReport(list(dict.fromkeys(errors)), list(dict.fromkeys(hints)))

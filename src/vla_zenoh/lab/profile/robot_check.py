@@ -17,7 +17,7 @@ from vla_zenoh.errors import (
     VlaZenohError,
     nearest,
 )
-from vla_zenoh.profile import POSE_JOINTS, Profile
+from vla_zenoh.profile import POSE_JOINTS, Profile, ReachLimits
 from vla_zenoh.profile.section import Place
 from vla_zenoh.types import FloatArray
 
@@ -31,6 +31,9 @@ WIDTHS = 1.5
 """Factor between the widths of a description and a profile: one finger of two is twice as much."""
 POSTURES = 8
 """At which the axes of an arm are looked at."""
+SINGULAR_POSTURES, MOSTLY_SLOW, USUALLY_SLOW = 200, 0.8, 0.33
+"""At so many the singular values are looked at; more of an arm slow than the first share is odd,
+and the second is what the shipped arms have."""
 LONG_BRAKE_S = 2.5
 """`up` ends a robot's node 2.8 s after Ctrl-C, less the time until the node gets the signal.
 See `STOP_ORDER` in `vla_zenoh.runtime.supervisor`."""
@@ -206,8 +209,46 @@ def joints_advice(profile: Profile) -> Iterator[str]:
         f"robot.arm_joints: {joints} joints cannot reach every pose, as six can. At home the TCP "
         f"cannot move along or about these axes alone: {axes}. Steps of a model along them are "
         "shortened to nothing, activation is rejected while its newest chunk asks for one, and "
-        "models with absolute poses or joint positions are rejected altogether"
+        "models with absolute poses are rejected altogether, with robot.command: pose those with "
+        "joints as well"
     )
+
+
+def singularity_limits(
+    kinematics: Kinematics, limits: ReachLimits
+) -> tuple[str, float, float] | None:
+    """Why the limits of singularities are those of a larger arm, and slow and stop that suit.
+
+    None: they suit it.
+    """
+    import numpy as np
+
+    from vla_zenoh.kinematics.kinematics import smallest_singular_value
+
+    random = np.random.default_rng(1)
+    postures = random.uniform(*kinematics.sampled_rad, (SINGULAR_POSTURES, kinematics.size))
+    values = np.array([smallest_singular_value(kinematics.jacobian(each)) for each in postures])
+    slow, stop = (values < limits.singularity_slow).mean(), limits.singularity_stop
+    if slow <= MOSTLY_SLOW:
+        return None
+    usual = float(np.quantile(values, USUALLY_SLOW))
+    why = (
+        f"the arm is slow in {slow:.0%} of its postures, and in {(values < stop).mean():.0%} below "
+        "singularity_stop, where it does not go by itself"
+    )
+    return why, float(f"{usual:.1g}"), float(f"{0.3 * usual:.1g}")
+
+
+def singular_advice(profile: Profile) -> Iterator[str]:
+    """Advice where the limits of singularities are those of a larger arm."""
+    reach = _reach(profile)
+    found = reach and singularity_limits(reach.kinematics, profile.limits.reach)
+    if reach and found:
+        why, slow, stop = found
+        yield (
+            f"limits.reach.singularity_slow: {why}: these are limits of a larger arm. {slow:g} and "
+            f"{stop:g} suit one of {reach.kinematics.length_m:.2f} m"
+        )
 
 
 def _axes_advice(kinematics: Kinematics) -> Iterator[str]:
