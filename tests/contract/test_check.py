@@ -48,6 +48,7 @@ ERRORS = {
     "prompt": ("inference_failed", "a strange prompt: UnicodeEncodeError"),
     "horizon": ("horizon", "a chunk of 8 steps, the spec says 1 to 4"),
     "shape": ("shape", r"steps have shape \(4, 6\), the spec says \(H, 7\)"),
+    "coroutine": ("dtype", "declare it with def, not async def"),
     "objects": ("dtype", "steps are not numbers but object"),
     "tensor": ("dtype", r"requires grad. Use tensor.detach\(\)"),
     "nan": ("not_finite", "NaN"),

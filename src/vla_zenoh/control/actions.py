@@ -239,7 +239,7 @@ def step_width(
     if spec.gripper == "delta_m":
         wanted_m = before_m + value
     elif spec.gripper == "binary":
-        wanted_m = max_width_m * ((value > spec.gripper_threshold) == spec.gripper_open_is_high)
+        wanted_m = max_width_m * spec.opens(value)
     else:
         wanted_m = max_width_m * spec.gripper_scale(max_width_m).decode(value)
     return min(max(wanted_m, 0.0), max_width_m)

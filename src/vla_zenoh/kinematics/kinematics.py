@@ -338,8 +338,10 @@ class InverseKinematics:
         self.lower_rad = kinematics.lower_rad + joint_margin_rad
         self.upper_rad = kinematics.upper_rad - joint_margin_rad
         if np.any(self.lower_rad >= self.upper_rad):
-            name = kinematics.arm_joints[int(np.argmin(self.upper_rad - self.lower_rad))]
-            raise RecordError(f"joint_margin_rad {joint_margin_rad} leaves {name!r} no range")
+            worst = int(np.argmin(self.upper_rad - self.lower_rad))
+            name, unit = kinematics.arm_joints[worst], kinematics.unit(worst)
+            margin = np.broadcast_to(joint_margin_rad, kinematics.size)[worst]
+            raise RecordError(f"joint_margin_{unit} {margin:g} leaves {name!r} no range")
         self.posture_rad = posture_rad.copy()
 
     def approach(self, pose: Pose, start_rad: FloatArray, *, bounded: bool = True) -> Approach:

@@ -159,6 +159,9 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
         SpecError: says what is wrong and what was declared; its reason is ``dtype``, ``shape``,
             ``horizon`` or ``not_finite``.
     """
+    if inspect.iscoroutine(steps):
+        steps.close()
+        raise SpecError("infer gave a coroutine: declare it with def, not async def", "dtype")
     try:
         given = np.asarray(steps)
     except Exception as error:  # tensors raise anything

@@ -345,6 +345,10 @@ class ActionSpec(_Spec):
         """The columns of the rotation numbers in one step."""
         return slice(3, 3 + self.rotation_form.size)
 
+    def opens(self, number: float) -> bool:
+        """Whether a ``binary`` number opens the gripper; one at the threshold is low."""
+        return (number > self.gripper_threshold) == self.gripper_open_is_high
+
     def gripper_scale(self, max_width_m: float) -> GripperScale:
         """What the gripper's number says of the opening, where it is one.
 

@@ -121,6 +121,8 @@ def test_a_rotation_that_is_no_unit_quaternion_is_refused() -> None:
         ({"gripper": "binary", "gripper_open_is_high": False}, 0.7, 0.08, 0.0),
         ({"gripper": "binary", "gripper_threshold": 0.0}, 0.1, 0.0, 0.08),
         ({"gripper": "binary", "gripper_threshold": 0.0}, -1.0, 0.08, 0.0),
+        ({"gripper": "binary", "gripper_threshold": 0.0}, 0.0, 0.08, 0.0),
+        ({"gripper": "binary", "gripper_open_is_high": False}, 0.5, 0.0, 0.08),
     ],
 )
 def test_a_gripper_number_means_what_the_spec_says(

@@ -138,7 +138,7 @@ def raw_steps(steps: NDArray[np.float32], spec: ActionSpec, wanted: ActionSpec) 
     if wanted.gripper == "binary":
         mine = (spec.gripper_open_is_high, spec.gripper_threshold)
         if mine != (wanted.gripper_open_is_high, wanted.gripper_threshold):
-            opens = (out[:, -1] > spec.gripper_threshold) == spec.gripper_open_is_high
+            opens = np.array([spec.opens(number) for number in out[:, -1]])
             high = opens == wanted.gripper_open_is_high
             out[:, -1] = wanted.gripper_threshold + np.where(high, 1.0, -1.0)
     return out

@@ -299,8 +299,10 @@ def _actions(spec: ActionSpec, steps: NDArray[np.float32], run: Run, part: str) 
     if spec.gripper != "none":
         robot = run.of_part(part).profile.robot
         max_width_m = robot.require_gripper(f"{run.path}: gripper={spec.gripper}").max_width_m
-        shares = [spec.gripper_scale(max_width_m).decode(number) for number in rows[:, -1]]
-        rows[:, -1] = np.greater(shares, 0.5) if spec.gripper == "binary" else shares
+        scale, binary = spec.gripper_scale(max_width_m), spec.gripper == "binary"
+        rows[:, -1] = [
+            spec.opens(number) if binary else scale.decode(number) for number in rows[:, -1]
+        ]
     return semantics_of(spec, run.of_part(part).profile).rows(rows)
 
 

@@ -283,7 +283,9 @@ class PrimitivesNode:
 
     def _to_pose(self, request: MoveTo, sight: Sight) -> tuple[Ending, Target]:
         if len(self._profile.robot.arm_joints) < POSE_JOINTS:
-            raise Rejected("a pose needs an arm of six joints: give joints_rad")
+            raise Rejected(
+                "a pose needs an arm of six joints: give joints_rad (`do move-to --joints`)"
+            )
         here = pose_of(sight.pose)
         position_m = here.position_m if request.position_m is None else request.position_m
         quat = request.quat_xyzw

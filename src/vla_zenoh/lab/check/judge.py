@@ -95,7 +95,7 @@ def _opening(spec: ActionSpec, steps: Steps) -> NDArray[np.float64] | None:
         return None
     value = steps[:, -1].astype(np.float64)
     if spec.gripper == "binary":
-        value = (value > spec.gripper_threshold).astype(np.float64)
+        return np.array([float(spec.opens(number)) for number in value])
     return value if spec.gripper_open_is_high else 1.0 - value
 
 
