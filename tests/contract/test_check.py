@@ -295,6 +295,7 @@ SEVEN_JOINTS: dict[str, Any] = {
         (spec(FRONT, gripper="none"), {}, {("note", "no_gripper")}),
         (spec(FRONT), {"task": {"prompt": ""}}, {("warning", "no_prompt")}),
         (spec(FRONT, horizon=1), {}, {("note", "gaps")}),
+        (spec(FRONT, horizon=1, dt_s=0.3), {}, {("warning", "rushes")}),
         (spec(FRONT), FIVE_JOINTS, {("warning", "too_few_joints")}),
         (spec(FRONT, **SEVEN_JOINTS), {}, {("warning", "joints_by_pose")}),
         (spec(FRONT, **SEVEN_JOINTS), {"robot": {"command": "joint"}}, set()),

@@ -11,7 +11,7 @@ A chunk whose observation was taken at ``t_o`` asks for waypoints ``W_1 .. W_H``
     in force at t: W_k, k = floor((t - t_1) / dt) + 1, at least 1 and at most H
 
     G(t) = W_s, s = (t - t_1) / dt, at most H, between two waypoints interpolated
-    s    at least 1 for a chunk of one delta, see `first_step_counts_whole`
+    s    at least 1 for a chunk of one delta, see `least_steps`
 
 Where a controller covers only a part of each step, its response is what is interpolated, and its
 rate is part of W and G. Between chunks it stands still, as a simulator does during inference.

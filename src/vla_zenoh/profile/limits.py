@@ -249,7 +249,8 @@ class Limits(Section):
         contact: of forces and torques.
         step_m: largest translation of one action step.
         step_rad: largest rotation of one action step.
-        approach_m_s: speed towards an absolute target that is further away than a step.
+        approach_m_s: speed towards an absolute target while it is further away than a step; the
+            last step is as fast as any other.
         approach_rad_s: angular speed towards it.
         out_of_bounds: ``clamp`` shortens to the limit and emits an event, ``refuse`` rejects the
             whole chunk.

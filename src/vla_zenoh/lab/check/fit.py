@@ -101,6 +101,12 @@ def _timing(profile: Profile, spec: ModelSpec, rate_hz: float) -> Iterator[Findi
             f"a chunk lasts {chunk_s:g} s and one is asked for every {1 / rate_hz:g} s: the arm "
             "waits in between",
         )
+    if spec.action.horizon == 1 and spec.action.kind == "delta" and chunk_s * rate_hz > 1.0 + 1e-9:
+        yield warning(
+            "rushes",
+            f"a delta is to take {chunk_s:g} s and one is asked for every {1 / rate_hz:g} s: each "
+            "is a whole step, so the arm goes faster than the model was made for",
+        )
     if why := wrong_rate(spec, rate_hz):
         yield error("rate", why)
     oldest_s = profile.timing.max_observation_age_s
