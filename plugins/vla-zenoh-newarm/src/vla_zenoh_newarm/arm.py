@@ -88,7 +88,8 @@ def found_arm(source: Path, copy: Path, arguments: Mapping[str, str], answers: A
     )
     table_z_m = heights[0] if heights else None
     of_size = limits_of_size(kinematics)
-    home = posture_of(kinematics, ReachLimits(table_z_m=table_z_m).model_copy(update=of_size), answers)
+    reach = ReachLimits(table_z_m=table_z_m).model_copy(update=of_size)
+    home = posture_of(kinematics, reach, answers)
     for name in of_size:
         what = f"by the size of the arm, {kinematics.length_m:.2f} m"
         answers.guesses.append(Guess(f"limits.reach.{name}", what))
