@@ -171,7 +171,7 @@ _COMMANDS_OF: Mapping[str, str] = {
     "vla-zenoh-canary": "canary.watch canary.promote canary.back",
     "vla-zenoh-conform": "conform.robot conform.worker conform.camera",
     "vla-zenoh-dataset": "dataset.export dataset.stats",
-    "vla-zenoh-diagnose": "inspect net",
+    "vla-zenoh-diagnose": "inspect net keys echo",
     "vla-zenoh-figures": "figure.motion figure.latency figure.success",
     "vla-zenoh-mcp": "serve.mcp",
     "vla-zenoh-newarm": "profile.new",

@@ -23,6 +23,7 @@ import r2c_peer
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
 from vla_zenoh_diagnose import inferences, net
+from vla_zenoh_diagnose import keys as cli_keys
 from vla_zenoh_diagnose.inference_views import InferenceView
 from vla_zenoh_franka_node import wire as franka_node
 from vla_zenoh_mcp import protocol
@@ -45,7 +46,6 @@ from vla_zenoh.client.answer import Answer, decode_answer
 from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.cli import keys as cli_keys
 from vla_zenoh.lab.cli.options import number_list
 from vla_zenoh.lab.cli.output import plain_types
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted

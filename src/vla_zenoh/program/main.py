@@ -90,8 +90,8 @@ COMMANDS: Panels = {
         "replay": OF_A_PACKAGE,
         "eval": "lab.cli.evaluate:evaluation",
         "otel": OF_A_PACKAGE,
-        "keys": "lab.cli.keys:keys",
-        "echo": "lab.cli.keys:echo",
+        "keys": OF_A_PACKAGE,
+        "echo": OF_A_PACKAGE,
     },
     "Check and measure": {
         "check": "lab.cli.check:check",
