@@ -59,6 +59,15 @@ def test_a_plan_has_asked_for_the_time_it_had_and_for_one_step_at_least(
     assert height(plan.goal_at(int(t_ms * MS))) == pytest.approx(0.3 + steps * STEP_M)
 
 
+@pytest.mark.parametrize(
+    ("t_ms", "steps"), [(-50, 0.0), (0, 0.0), (30, 0.3), (100, 1.0), (150, 1.5), (400, 3.0)]
+)
+def test_a_plan_that_has_a_begin_has_asked_for_the_time_it_had(t_ms: float, steps: float) -> None:
+    plan = Plan(0, 0, DT_NS, rising(at(0.3), 3), begin=at(0.3))
+    assert height(plan.goal_at(int(t_ms * MS))) == pytest.approx(0.3 + steps * STEP_M)
+    assert plan.steps_until(int(t_ms * MS)) == pytest.approx(steps)
+
+
 def test_between_two_waypoints_of_joints_the_width_goes_along() -> None:
     wide, narrow = (joint_goal(panda(), HOME_RAD, width_m) for width_m in (0.08, 0.04))
     assert wide.between(narrow, 0.25).width_m == pytest.approx(0.07)

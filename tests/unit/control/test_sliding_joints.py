@@ -165,6 +165,17 @@ def has_settled(way: FloatArray) -> bool:
     return settling.unsettled(arm().forward(HOME), HOME) == []
 
 
+def test_the_joint_that_is_furthest_for_its_kind_is_told_where_an_arm_has_not_settled() -> None:
+    """0.0035 rad of a joint that turns is near, 0.003 m of one that slides is not."""
+    settling = Settling(arm())
+    slides = arm().slides
+    way = np.where(slides, 0.0, 0.0035)
+    way[int(np.flatnonzero(slides)[0])] = 0.003
+    settling.measure(pose(), state(held=way), NOW_NS)
+    (why,) = settling.unsettled(arm().forward(HOME), HOME)
+    assert "its joints 0.003 m" in why
+
+
 def stands_in_commands(rates: FloatArray) -> bool:
     stage = PoseToJoint(profile(), arm())
     stage._now = stage._now._replace(velocity_rad_s=rates)
