@@ -309,7 +309,10 @@ def test_a_chunk_is_a_ribbon_from_the_goal_its_observation_saw(shown: Shown) -> 
     np.testing.assert_allclose(strip, expected, atol=POSITION_TOLERANCE_M)
 
 
-def test_a_chunk_in_the_middle_of_another_stands_on_what_that_had_asked_for(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seen_ms", [200, 400])
+def test_a_chunk_in_the_middle_of_another_stands_on_what_that_had_asked_for(
+    tmp_path: Path, seen_ms: int
+) -> None:
     """The command stream says where a step ends; half of it is done when the observation is."""
     start_ns = 150 * MS
     shown = heard(
@@ -318,10 +321,10 @@ def test_a_chunk_in_the_middle_of_another_stands_on_what_that_had_asked_for(tmp_
         put(KEYS.command_pose, command(0), 0),
         chunk(start_ns, 1),  # the first one, so it begins then: its step 2 ends at 550 ms
         put(KEYS.command_pose, command(200 * MS), start_ns, 1),
-        chunk(400 * MS + 50 * MS, 2),
+        chunk(seen_ms * MS + 50 * MS, 2),
     )[1]
     _, ((second, *_),) = shown.values("world/chunk/scripted", "LineStrips3D:strips")
-    # Two steps are asked for by 550 ms; at 400 ms one and a quarter of them.
+    # At 200 ms a quarter of the first step is asked for, at 400 ms one and a quarter of two.
     assert second[2] == pytest.approx(goal_m(200 * MS)[2] - 0.75 * STEP_M, abs=POSITION_TOLERANCE_M)
 
 

@@ -14,7 +14,7 @@ from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.plan_timeline import Goal, Plan
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh.policy.plan_clock import idle_time
+from vla_zenoh.policy.plan_clock import idle_time, least_steps
 from vla_zenoh.profile import KeepOut, Profile
 from vla_zenoh.types import ActionChunk, FloatArray, ObjectPoses
 from vla_zenoh_view import paths
@@ -175,7 +175,9 @@ class Scene:
         before, seen_ns = self._plans.get(chunk.worker), chunk.observation_stamp_ns
         runs = [] if before is None else [(before.effective_ns, before.end_ns)]
         idle_ns = round(idle_time(seen_ns, stamp_ns, runs))
-        self._plans[chunk.worker] = Plan(stamp_ns, seen_ns, dt_ns, goals, idle_ns=idle_ns)
+        begin = None if least_steps(action, len(goals)) else Goal(start, 0.0)
+        plan = Plan(stamp_ns, seen_ns, dt_ns, goals, idle_ns=idle_ns, begin=begin)
+        self._plans[chunk.worker] = plan
         self._ribbons[chunk.worker] = stamp_ns
         line = np.array([start.position_m, *(goal.pose.position_m for goal in goals)])
         colour = paths.CHUNK if obeyed else paths.SHADOW
