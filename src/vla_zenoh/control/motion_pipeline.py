@@ -314,7 +314,8 @@ class MotionPipeline:
     def _hold(self, mover: Mover, timeline: GoalTimeline, now_ns: int) -> list[Event]:
         """Stand where the motion ends, and report what is dropped of the plan in force."""
         plan = timeline.plan
-        rest = mover.resting_goal(mover.tcp.pose, timeline.at(now_ns).width_m)
+        # As the gripper was told: half way to it a gripper that shuts would let go.
+        rest = mover.resting_goal(mover.tcp.pose, plan.goals[plan.index_at(now_ns)].width_m)
         timeline.hold(rest, now_ns)
         self.scaling.stand()
         return _dropped(plan, rest)

@@ -45,6 +45,21 @@ def test_after_a_pause_the_rest_of_an_old_chunk_is_not_carried_out(minutes: floa
     np.testing.assert_allclose(rig.position_m - stands_m, [0, 0, STEP_M], atol=SAME_M)
 
 
+@pytest.mark.parametrize("shut_from", [0, 1])
+def test_after_a_pause_the_gripper_stays_as_it_was_told(shut_from: int) -> None:
+    """The pause begins within the step that shuts it: half open it would let go."""
+    rig = Rig(dt_s=DT_S, gripper="absolute_m")
+    rig.activate()
+    rig.send([[0.0, 0, STEP_M, 0, 0, 0, 0.08 if k < shut_from else 0.0] for k in range(10)])
+    rig.run((shut_from + 0.5) * DT_S)
+    assert rig.widths_m[-1:] == [0.0]
+    rig.put("speed", 0.0)
+    rig.run(1.0)
+    rig.put("speed", 50.0)
+    rig.run(1.0)
+    assert rig.widths_m[-1:] == [0.0]
+
+
 def test_after_a_pause_without_a_chunk_the_watchdog_brakes() -> None:
     rig = moving_rig()
     rig.put("speed", 0.0)
