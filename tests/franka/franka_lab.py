@@ -29,7 +29,9 @@ PROFILE = """
 extends: fr3
 franka: {{address: {address}, realtime: ignore{franka}}}
 robot: {{command: {command}}}
-limits: {{workspace: {{z_m: [0.012, 0.95]}}}}
+limits:
+  workspace: {{z_m: [0.012, 0.95]}}
+  contact: {{effort_slow_nm: null, effort_stop_nm: null}} # franka-sim reports zeros
 task: {{prompt: hold, rate_hz: 10, worker: scripted}}
 session: {{listen: [{endpoint}], connect: [{endpoint}]}}
 timing:

@@ -21,7 +21,9 @@ from vla_zenoh.lab.demo.scripted_motions import STEP_M
 PROFILE = """
 extends: fr3_franka_node
 franka_node: {{endpoint: "{endpoint}"}}
-limits: {{workspace: {{z_m: [0.012, 0.95]}}}}
+limits:
+  workspace: {{z_m: [0.012, 0.95]}}
+  contact: {{effort_slow_nm: null, effort_stop_nm: null}} # franka-sim reports zeros
 task: {{prompt: hold, rate_hz: 10, worker: scripted}}
 session: {{listen: [{endpoint}], connect: [{endpoint}]}}
 timing: {{command_timeout_s: {patience_s[command]}, state_timeout_s: {patience_s[state]}}}

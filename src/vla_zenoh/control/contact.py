@@ -147,19 +147,30 @@ def _greatest(values: FloatArray) -> float:
 
 
 class Repetition:
-    """Whether a reading stays the same to the last bit while the arm moves further than `most`."""
+    """Whether a reading is of no sensor: it never was anything but zeros, or stays the same to the
+    last bit while the arm moves further than `most`.
 
-    def __init__(self, most: float) -> None:
-        self._most = most
+    Args:
+        most: in the unit of the place.
+        simulated: zeros are of an arm that touches nothing; a real sensor has noise.
+    """
+
+    def __init__(self, most: float, *, simulated: bool = False) -> None:
+        self._most, self._simulated = most, simulated
         self._first: tuple[FloatArray, FloatArray] | None = None
+        self._only_zeros = True
 
     def add(self, reading: FloatArray, place: FloatArray) -> bool:
         """Add a reading that was taken at this place (n,)."""
+        zeros = not reading.any()
+        if zeros and self._simulated:
+            self._first = None
+            return False
+        self._only_zeros &= zeros
         first = self._first
         if first is None or not np.array_equal(reading, first[0]):
-            self._first = reading, place
-            return False
-        return _norm(place - first[1]) > self._most
+            self._first = first = reading, place
+        return self._only_zeros or _norm(place - first[1]) > self._most
 
 
 class Contact(Monitor):
@@ -167,8 +178,7 @@ class Contact(Monitor):
 
     Args:
         limits: slow and stop of each kind of load.
-        simulated: the robot is, so a wrench of zeros is that of an arm which touches nothing; a
-            real sensor has noise.
+        simulated: the robot is, so a wrench of zeros is measured.
     """
 
     def __init__(self, limits: ContactLimits, *, simulated: bool = False) -> None:
@@ -186,8 +196,8 @@ class Contact(Monitor):
         self._begun: list[Load] = []
         self._reported = True
         """What was told last about `known`."""
-        self._simulated = simulated
-        self._wrenches, self._efforts = Repetition(FROZEN_M), Repetition(FROZEN_RAD)
+        self._wrenches = Repetition(FROZEN_M, simulated=simulated)
+        self._efforts = Repetition(FROZEN_RAD)
 
     @property
     def measured(self) -> list[Load]:
@@ -199,7 +209,7 @@ class Contact(Monitor):
         """Add the newest pose, with the wrench if the robot measures one."""
         wrench, stamp_ns = state.record.wrench, state.header.stamp_wall_ns
         if wrench is not None and self._wrenches.add(wrench, state.record.position_m):
-            wrench = wrench if self._simulated and not wrench.any() else None
+            wrench = None
         force, torque = (None, None) if wrench is None else (wrench[:3], wrench[3:])
         for load, measured in ((self._force, force), (self._torque, torque)):
             load.update(measured, stamp_ns, drifts=self._active)
@@ -280,8 +290,9 @@ class Contact(Monitor):
         ]
         if self.wants_effort and not self._effort.known:
             reasons.append(
-                "limits.contact.effort_stop_nm is set, and the robot reports no joint efforts; "
-                "take the limit out, or let the robot report its external joint torques"
+                "limits.contact.effort_stop_nm is set, and the robot reports no joint efforts, or "
+                "only zeros; take the limit out (effort_slow_nm: null, effort_stop_nm: null), or "
+                "let the robot report its external joint torques"
             )
         return reasons
 

@@ -21,7 +21,7 @@ class Arm:
     """Says its wrench every 5 ms."""
 
     def __init__(self, **limits: Any) -> None:
-        self.contact = Contact(ContactLimits(**limits))
+        self.contact = Contact(ContactLimits(**limits), simulated=True)
         self.now_ns = 10**18
 
     def feels(
@@ -198,7 +198,7 @@ def test_an_activation_needs_the_efforts_that_the_profile_limits() -> None:
     arm = active(effort_slow_nm=5.0, effort_stop_nm=10.0)
     (reason,) = arm.contact.missing
     assert "effort_stop_nm" in reason
-    arm.strains(0.0, 0.0, s=0.1)
+    arm.strains(0.0, 0.01, s=0.1)
     assert not arm.contact.missing
     arm.contact.begin()
     state = JointState(JOINTS, np.zeros(2), np.zeros(2), None)

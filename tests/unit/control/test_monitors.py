@@ -130,7 +130,7 @@ def test_the_arm_brakes_at_its_force_however_slowly_it_rises_and_whatever_was_th
 @pytest.mark.parametrize("gap_s", [30.0, -30.0])
 def test_a_load_is_not_got_used_to_while_nothing_is_measured(gap_s: float) -> None:
     contact, now_ns = Contact(ContactLimits(force_slow_n=20.0, force_stop_n=STOP_N)), START_NS
-    contact.update_pose(pressed(np.zeros(3), now_ns))
+    contact.update_pose(pressed(np.array([0.01, 0.0, 0.0]), now_ns))
     contact.begin()
     now_ns += round(gap_s * 1e9)
     for _ in range(50):
@@ -151,14 +151,40 @@ def test_a_wrench_that_stays_the_same_while_the_arm_moves_is_not_measured(
     force_n: tuple[float, ...],
 ) -> None:
     contact = Contact(ContactLimits())
-    contact.update_pose(pressed(np.array(force_n), START_NS))
+    contact.update_pose(pressed(np.array([0.5, 0.0, 0.0]), START_NS))
     contact.begin()
-    for tick in range(100):
+    for tick in range(1, 100):
         state = pressed(np.array(force_n), START_NS + 4 * MS * tick)
         at_m = START_M + [0.0, 0.0, 0.001 * tick]
         contact.update_pose(replace(state, record=replace(state.record, position_m=at_m)))
     assert "no longer measures contact_force" in contact.lost
     assert "report none" in contact.lost
+
+
+def test_a_wrench_that_was_never_anything_but_zeros_is_not_measured() -> None:
+    contact = Contact(ContactLimits())
+    contact.update_pose(pressed(np.zeros(3), START_NS))
+    event = contact.news()
+    assert event is not None
+    assert event.what == "contact_not_told"
+    contact.begin()
+    for tick in range(1, 100):
+        state = pressed(np.zeros(3), START_NS + 4 * MS * tick)
+        at_m = START_M + [0.0, 0.0, 0.001 * tick]
+        contact.update_pose(replace(state, record=replace(state.record, position_m=at_m)))
+    assert not contact.lost, "it was none when the activation began"
+    # A sensor with a dead band: what presses counts from the first reading on.
+    for tick in range(100, 150):
+        contact.update_pose(pressed(np.array([41.0, 0.0, 0.0]), START_NS + 4 * MS * tick))
+    load = contact.overload()
+    assert load is not None
+    assert load.name == "contact_force"
+
+
+def joints(effort_nm: tuple[float, ...], at_rad: float, tick: int) -> Stamped[JointState]:
+    state = JointState(("one", "two"), np.array([at_rad, 0.0]), np.zeros(2), np.array(effort_nm))
+    now_ns = START_NS + 4 * MS * tick
+    return Stamped(Header(now_ns, tick, "arm-1"), state, now_ns)
 
 
 @pytest.mark.parametrize("effort_nm", [(0.0, 0.0), (1.0, 2.0)])
@@ -167,15 +193,20 @@ def test_efforts_that_stay_the_same_while_the_joints_move_are_not_measured(
     effort_nm: tuple[float, ...], moves: float, why: str
 ) -> None:
     contact = Contact(ContactLimits(effort_stop_nm=10.0))
-    for tick in range(100):
-        at_rad = np.array([moves * tick, 0.0])
-        state = JointState(("one", "two"), at_rad, np.zeros(2), np.array(effort_nm))
-        now_ns = START_NS + 4 * MS * tick
-        contact.update_joints(Stamped(Header(now_ns, tick, "arm-1"), state, now_ns))
-        if tick == 0:
-            contact.begin()
+    contact.update_joints(joints((0.1, 0.1), 0.0, 0))
+    contact.begin()
+    for tick in range(1, 100):
+        contact.update_joints(joints(effort_nm, moves * tick, tick))
     assert why in contact.lost
     assert bool(contact.lost) == bool(why)
+
+
+def test_an_arm_whose_efforts_are_zeros_is_not_activated_where_they_have_a_limit() -> None:
+    contact = Contact(ContactLimits(effort_stop_nm=10.0))
+    contact.update_joints(joints((0.0, 0.0), 0.0, 0))
+    assert any("or only zeros" in why for why in contact.missing)
+    contact.update_joints(joints((0.0, 0.01), 0.0, 1))
+    assert not contact.missing
 
 
 def test_a_simulated_arm_that_touches_nothing_may_move_as_far_as_it_likes() -> None:
