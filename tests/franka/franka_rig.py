@@ -40,6 +40,19 @@ class Simulator:
         """What ended motions, from line `since` on."""
         return [line for line in self.lines[since:] if "aborting the motion" in line]
 
+    def freeze(self) -> None:
+        """Stand still. The group, as uv, which runs it, does not pass such a signal on."""
+        os.killpg(self.process.pid, signal.SIGSTOP)
+
+    def go_on(self) -> None:
+        """End `freeze`."""
+        os.killpg(self.process.pid, signal.SIGCONT)
+
+    def kill(self) -> None:
+        """Be gone at once."""
+        os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
     def lose_object(self) -> None:
         """Take away what is between the fingers."""
         self.process.send_signal(signal.SIGUSR1)
@@ -106,7 +119,7 @@ def simulator(*options: str, port: int = PORT) -> Iterator[Simulator]:
             try:
                 process.wait(ENDS_S)
             except subprocess.TimeoutExpired:
-                process.kill()
+                os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
 
 
