@@ -26,7 +26,7 @@ from command_rig import (
 
 from vla_zenoh.control.axis_smoothing import AxisSmoother
 from vla_zenoh.control.commander import ANSWER_S, MAX_ANSWER_S, Commander, Inputs, Setting
-from vla_zenoh.control.limits import BEGIN_JOINT
+from vla_zenoh.control.limits import BEGIN_JOINT, BEGIN_M
 from vla_zenoh.control.motion_pipeline import LINGER_NS
 from vla_zenoh.keys import OPENING
 from vla_zenoh.kinematics.so3 import norm3
@@ -1169,6 +1169,27 @@ def test_activated_again_while_it_brakes_it_comes_to_rest_without_turning_back()
     rig.send([FORTH])
     rig.settle()
     assert rig.position_m[0] == pytest.approx(at_m + 0.02, abs=AT_GOAL_M)
+
+
+def test_an_arm_that_brakes_goes_on_without_a_step_where_its_controller_lags_at_an_activation() -> (
+    None
+):
+    rig = moving_rig()
+    rig.put("active", False)
+    rig.run(0.04)
+    measured = rig.pose_state
+
+    def late() -> Stamped[PoseState]:
+        state = measured()
+        held_m = state.record.position_m - [2 * BEGIN_M, 0.0, 0.0]
+        return replace(state, record=replace(state.record, reference_position_m=held_m))
+
+    rig.pose_state = late
+    rig.activate()
+    rig.pose_state = measured
+    rig.run(1.0)
+    assert rig.state == "active", rig.commander.why
+    rig.assert_smooth()
 
 
 @pytest.mark.slow

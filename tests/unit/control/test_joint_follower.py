@@ -247,6 +247,35 @@ def test_the_tcp_stays_in_a_corner_of_its_box_whose_faces_need_the_same_joints(
     assert -BEYOND_BOX_M <= beyond_m <= BEYOND_BOX_M
 
 
+def test_a_motion_that_slow_joints_bound_is_planned_so_that_no_pose_waits_for_them() -> None:
+    arm = Arm(profile(velocity_rad_s=0.3))
+    arm.goal = Pose(arm.goal.position_m + [0.0, 0.2, -0.1], arm.goal.rotation)
+    while not arm.smoother.at_rest or not arm.speed_m_s():
+        here = arm.smoother.motion
+        arm.smoother.target(arm.goal, arm.stage.shares(here, arm.goal, arm.smoother.box))
+        for _ in range(STEP_TICKS):
+            arm.tick()
+            assert arm.stage.time_rate == 1.0
+            assert arm.lag()[0] < STRAIGHT_M
+
+
+@pytest.mark.parametrize("joint", range(7))
+def test_a_joint_at_its_velocity_slows_the_others_alike(joint: int) -> None:
+    most = np.full(7, 100.0)
+    free, slow = (
+        JointFollower(KINEMATICS, HOME_RAD, velocity_rad_s=limits)
+        for limits in (most, np.where(np.arange(7) == joint, 0.05, most))
+    )
+    rest = JointMotion(HOME_RAD, np.zeros(7), np.zeros(7), np.zeros(7))
+    target = KINEMATICS.forward(HOME_RAD + 0.1)
+    wanted, kept = (
+        of.step(rest, target, np.zeros(6), TICK_S)[0].wanted_rad_s for of in (free, slow)
+    )
+    assert abs(wanted[joint]) > 0.1
+    assert abs(kept[joint]) == pytest.approx(0.05)
+    np.testing.assert_allclose(kept, wanted * 0.05 / abs(wanted[joint]), rtol=1e-6)
+
+
 @st.composite
 def constrained_velocities(draw: st.DrawFn) -> tuple[FloatArray, ...]:
     """What `nearest_velocities` takes, of three joints and two constraints."""
