@@ -49,7 +49,8 @@ def main(
             node.put(f"camera/{camera}/raw", rgb.tobytes(), raw, IMAGES, stamp_ns)
             jpeg_kind = zenoh.Encoding("image/jpeg")
             node.put(f"camera/{camera}/jpeg", jpeg.tobytes(), jpeg_kind, IMAGES, stamp_ns)
-            node.publish_status("running")
+            age_s = (time.time_ns() - stamp_ns) / 1e9
+            node.publish_status("running", {"cameras": {camera: {"age_s": age_s}}})
             next_s = max(next_s + 1 / float(rate_hz), time.monotonic())
             time.sleep(max(next_s - time.monotonic(), 0.0))
 

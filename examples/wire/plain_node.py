@@ -97,7 +97,7 @@ class Node:
             **quality,
         )
 
-    def publish_status(self, state: str) -> None:
+    def publish_status(self, state: str, detail: dict | None = None) -> None:
         """Put the status, twice a second at most."""
         if time.monotonic() - self._status_s < 0.5:
             return
@@ -109,6 +109,7 @@ class Node:
             "pid": 0,
             "started_wall_ns": self._started_ns,
             "counters": {f"refused.{reason}": n for reason, n in self.rejected.items()},
+            "detail": detail or {},
         }
         self.publish(f"status/{self.name}", status, NEWS)
 

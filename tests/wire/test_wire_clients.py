@@ -28,6 +28,7 @@ from vla_zenoh.types import GripperState, ObjectPoses
 
 PROMPT = "put the red brick in the box"
 TASK_S = 40.0
+CAMERA_HZ = 10
 
 
 @pytest.mark.long
@@ -134,6 +135,23 @@ def test_conform_finds_nothing_wrong_with_the_worker_in_plain_python(
     assert status == 0
 
 
+def test_an_arm_is_activated_with_the_images_of_a_camera_in_plain_python(tmp_path: Path) -> None:
+    more = (
+        f"cameras: {{front: {{rate_hz: {CAMERA_HZ}}}, wrist: null}}\n"
+        "task: {prompt: hold, rate_hz: 5, worker: scripted}\n"
+        "options: {scripted: {camera: front}}\n"
+        "hosts: {here: {nodes: [router, sim, command, worker]}}\n"
+    )
+    path = profile_of(tmp_path, "panda_sim", more)
+    words = in_python(load_profile(str(path)), "camera.py", "front", str(CAMERA_HZ))
+    with running_chain(tmp_path, profile_file=path) as chain:
+        with running(words):
+            chain.activate_when_ready()
+            chain.until("a chunk is accepted", lambda: chain.detail("accepted_steps"))
+        chain.until("without the camera it is inactive", lambda: chain.state() == "inactive")
+        assert "camera" in chain.detail("why")
+
+
 FROZEN_CAMERA = """
 import itertools, numpy
 import camera
@@ -141,7 +159,6 @@ before, after = numpy.zeros((480, 640, 3), numpy.uint8), numpy.ones((480, 640, 3
 camera.images = lambda device: itertools.chain([before] * 50, itertools.repeat(after))
 """
 """The plain camera, whose image changes once."""
-CAMERA_HZ = 10
 
 
 @pytest.mark.parametrize("which", ["plain", "frozen"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -379,6 +379,7 @@ def camera_keys(name: str, wanted: CameraProfile) -> list[str]:
 def camera(seen: Seen, name: str, profile: Profile) -> Iterator[RuleFinding]:
     """All rules of a camera's node."""
     yield from presence(seen)
+    yield _age(seen, name)
     wanted = profile.cameras[name]
     width, height = wanted.width, wanted.height
     raw, jpeg, *depth = camera_keys(name, wanted)
@@ -394,6 +395,16 @@ def camera(seen: Seen, name: str, profile: Profile) -> Iterator[RuleFinding]:
             shown_m = ", ".join(f"{unit_m:g}" for unit_m in sorted(units_m))
             text = f"{shown_m} m a count, of the profile {wanted.depth_unit_m:g}"
             yield RuleFinding(f"{key}: unit", units_m == {wanted.depth_unit_m}, text)
+
+
+def _age(seen: Seen, name: str) -> RuleFinding:
+    """Whether the status says how old the newest image is, which every activation needs."""
+    told = [status.detail.get("cameras") for status in _records(seen, f"status/{seen.node}")]
+    fields = [cameras.get(name) for cameras in told if isinstance(cameras, Mapping)]
+    ages_s = [each.get("age_s") for each in fields if isinstance(each, Mapping)]
+    text = f"detail.cameras.{name}.age_s in {len(ages_s)} of {len(told)}"
+    right = bool(told) and all(isinstance(age_s, int | float) for age_s in ages_s)
+    return RuleFinding("status: age of its images", right and len(ages_s) == len(told), text)
 
 
 def _images(seen: Seen, key: str, rate_hz: float, wanted: tuple[int, int]) -> Iterator[RuleFinding]:
