@@ -140,7 +140,7 @@ def _write_run(
             seen_ms = begin_ms + CHUNK_MS * chunk + 5
             seen_ns, seq = ZERO_NS + seen_ms * MS, seq + 1
             times = (seen_ns + MS, seen_ns + 2 * MS, seen_ns + 30 * MS)
-            steps = steps_of(number, chunk, said.action.dimension)
+            steps = steps_of(number, chunk, said.action.dimension)[: said.action.horizon]
             made = ActionChunk(
                 "teacher", said.hash, number + 1, seen_ns, seq, seen_ns + 10**9, steps, *times
             )

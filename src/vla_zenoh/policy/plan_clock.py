@@ -44,7 +44,8 @@ def idle_time(begin: float, end: float, runs: Iterable[tuple[float, float]]) -> 
 
 def least_steps(action: ActionSpec, steps: int) -> float:
     """How many of the `steps` of a chunk are executed at least, once it is in force."""
-    return 1.0 if steps == 1 and action.kind != "velocity" else 0.0
+    meant = [each.action for each in action.parts] or [action]
+    return 1.0 if steps == 1 and any(each.kind != "velocity" for each in meant) else 0.0
 
 
 class PlanClock:

@@ -139,6 +139,31 @@ def test_chunks_that_come_between_two_steps_do_not_add_any(dt_s: float, tmp_path
     assert np.abs(stamps_s - even_s).max() <= dt_s / 2 + 1e-6
 
 
+@pytest.mark.parametrize("dt_s", [0.15, 0.2, 0.3, 0.5, 1.0])
+def test_each_delta_that_was_executed_as_a_whole_is_a_frame_however_soon_the_next_one_came(
+    dt_s: float, tmp_path: Path
+) -> None:
+    run = make_run(tmp_path / "run.mcap", of=spec(dt_s=dt_s, horizon=1), prompts=PROMPTS[:1])
+    (episode,) = episodes_of(load_run(run))
+    actions = [frame.action for frame in episode.frames if frame.action[:6].any()]
+    wanted = [steps_of(0, chunk)[0] for chunk in range(CHUNKS)]
+    assert len(actions) >= CHUNKS - 1, "the end of the episode may cut the last one"
+    np.testing.assert_array_equal(actions, wanted[: len(actions)])
+    stamps_ms = [(frame.stamp_ns - ZERO_NS) / 1e6 for frame in episode.frames]
+    if dt_s > (CHUNK_MS + LATENCY_MS) / 1000:  # the arm never stood: each begins at its observation
+        assert np.diff(stamps_ms[1:]) == pytest.approx(CHUNK_MS, abs=1e-3)
+
+
+@pytest.mark.parametrize("dt_s", [0.3, 0.5, 1.0])
+def test_targets_that_came_sooner_than_a_step_lasts_are_frames_at_the_rate_of_the_steps(
+    dt_s: float, tmp_path: Path
+) -> None:
+    of = spec(dt_s=dt_s, horizon=1, kind="absolute")
+    run = make_run(tmp_path / "run.mcap", of=of, prompts=PROMPTS[:1])
+    (episode,) = episodes_of(load_run(run))
+    assert abs(len(episode.frames) - CHUNK_MS * CHUNKS / 1000 / dt_s) <= 1
+
+
 def test_standing_still_is_said_in_the_words_of_the_spec() -> None:
     step = np.arange(1, 9, dtype=np.float32)
     quaternion = spec(rotation="quaternion").action

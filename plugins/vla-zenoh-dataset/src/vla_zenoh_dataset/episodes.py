@@ -4,6 +4,8 @@ A frame is one step of that worker's chunks: step k of a chunk belongs to the st
 observation plus k steps. Steps that a newer chunk replaced are left out. If a chunk ran out before
 the next one arrived, frames without motion fill the gap, so all frames are `dt_s` apart. At a speed
 override of a share s a step takes dt_s / s: the frames are those of the same motion at full speed.
+So are they where chunks of one delta came sooner than a step lasts: the arm executed each of them
+as a whole, faster than the steps say, and each is a frame.
 
 Where a person took the arm from a model and gave it back, without a deactivation in between, that
 is one episode of the model. The frames that the person led are what the arm was commanded to do,
@@ -24,13 +26,15 @@ from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.recording.run import RecordedSample, Run, Span, is_within, newest
 from vla_zenoh.policy import ActionSpec, ModelSpec, standing_step
 from vla_zenoh.policy.meaning import wrapped
-from vla_zenoh.policy.plan_clock import idle_time
+from vla_zenoh.policy.plan_clock import idle_time, least_steps
 from vla_zenoh.policy.spec import PERSON
 from vla_zenoh.types import Header
 from vla_zenoh_dataset.corrections import commanded_motion
 from vla_zenoh_dataset.label import EpisodeLabel
 
 FPS_TOLERANCE = 0.01
+HALF_A_STEP = 0.5 + 1e-6
+"""As far as time runs ahead for a step that did not have half its time, so that it is counted."""
 
 
 class EpisodeGap(RecordingError):
@@ -190,7 +194,8 @@ def _episode(
     begins = [begun[chunks[0].header] if chunks else span[0] for span, chunks in parts]
     ends = [*begins[1:], led[-1][1]]
     frames: list[EpisodeFrame] = []
-    clock = StepClock(run.tasks, begins[0], ends[-1], spec.action.dt_s)
+    whole = _whole_steps(run, followed, [*begun.values(), ends[-1]])
+    clock = StepClock(run.tasks, begins[0], ends[-1], spec.action.dt_s, whole)
     for (span, chunks), end_ns in zip(parts, ends, strict=True):
         person = span[2] in people
         if chunks:
@@ -295,6 +300,20 @@ def _deltas(
     return action, rows
 
 
+def _whole_steps(
+    run: Run, followed: Sequence[RecordedSample], times_ns: Sequence[int]
+) -> list[tuple[int, int]]:
+    """When chunks of one delta were in force, from their begins and the end; not of the last one,
+    which the end of the episode may have cut."""
+    whole: list[tuple[int, int]] = []
+    for chunk, since_ns, until_ns in zip(followed[:-1], times_ns, times_ns[1:], strict=False):
+        spec, count = run.specs[chunk.record.spec_hash], len(chunk.record.steps)
+        adds = any(spec.action.of(part).kind == "delta" for part in spec.parts)
+        if adds and least_steps(spec.action, count):
+            whole.append((since_ns, until_ns))
+    return whole
+
+
 class StepClock:
     """Steps of an episode in time, at the speed override in force.
 
@@ -302,10 +321,17 @@ class StepClock:
         tasks: of the run, oldest first.
         begin_ns, end_ns: of the episode, wall clock.
         dt_s: of a step at full speed.
+        whole: from when to when something was in force that counts as a step at least, oldest
+            first, wall clock.
     """
 
     def __init__(
-        self, tasks: Sequence[RecordedSample], begin_ns: int, end_ns: int, dt_s: float
+        self,
+        tasks: Sequence[RecordedSample],
+        begin_ns: int,
+        end_ns: int,
+        dt_s: float,
+        whole: Sequence[tuple[int, int]] = (),
     ) -> None:
         self._begin_ns = begin_ns
         first = newest(tasks, begin_ns) or tasks[0]
@@ -316,6 +342,16 @@ class StepClock:
         self._passed_s = (np.array([*shares, end_ns]) - begin_ns) / 1e9
         each = np.diff(self._passed_s) * np.array([*shares.values()]) / dt_s
         self._steps = np.concatenate([[0.0], np.cumsum(each)])
+        times_s, ahead = [0.0], [0.0]
+        for since_ns, until_ns in whole:
+            since, until = (self.steps(at_ns) + ahead[-1] for at_ns in (since_ns, until_ns))
+            if since < until and round(since) == round(until):
+                times_s += [(at_ns - begin_ns) / 1e9 for at_ns in (since_ns, until_ns)]
+                ahead += [ahead[-1], ahead[-1] + round(since) + HALF_A_STEP - until]
+        passed_s = np.unique([*self._passed_s, *times_s])
+        self._steps = np.interp(passed_s, self._passed_s, self._steps)
+        self._steps += np.interp(passed_s, times_s, ahead)
+        self._passed_s = passed_s
 
     def steps(self, at_ns: int) -> float:
         """How many steps have passed at a time."""
