@@ -104,6 +104,8 @@ def _write_run(
     profile_yaml: str = PROFILE,
     ended: Mapping[str, Any] | None = None,
     set_back: tuple[str, float, float] | None = None,
+    commander: str = "command#1",
+    until_ms: float = 1e6,
 ) -> Path:
     """The recording of `write_run`.
 
@@ -118,6 +120,8 @@ def _write_run(
         cameras: those that were recorded.
         profile_yaml: the profile in force.
         ended: what stands at its end beside what was dropped.
+        commander: process that commands the arm.
+        until_ms: when the recorder ends.
         set_back: key (empty: all) whose writer's clock is set back, after how many ms, by how many.
     """
     said = of or spec()
@@ -170,7 +174,9 @@ def _write_run(
     out = RecordingWriter(
         path, KEYS, profile_yaml=profile_yaml, base_frame="base", began_ns=ZERO_NS
     )
+    samples = [each for each in samples if each.received_ns < ZERO_NS + until_ms * MS]
     for sample in sorted(samples, key=lambda each: each.received_ns):
+        sample = _by(commander, sample)
         out.write(sample if set_back is None else stamped_back(sample, *set_back))
     out.finish({"dropped": {}, **(ended or {})})
     return path
@@ -194,7 +200,11 @@ PERSON_WIDTH_M = 0.03
 
 
 def write_mixed_run(
-    path: Path, *, of: ModelSpec | None = None, ended: Mapping[str, Any] | None = None
+    path: Path,
+    *,
+    of: ModelSpec | None = None,
+    ended: Mapping[str, Any] | None = None,
+    commander: str = "command#1",
 ) -> Path:
     """One activation in which a person takes the arm from the model and gives it back.
 
@@ -250,9 +260,16 @@ def write_mixed_run(
         samples.append(Sample(key, picture(number), JPEG, header, at_ns + MS))
     out = RecordingWriter(path, KEYS, profile_yaml=PROFILE, base_frame="base", began_ns=ZERO_NS)
     for sample in sorted(samples, key=lambda each: each.received_ns):
-        out.write(sample)
+        out.write(_by(commander, sample))
     out.finish({"dropped": {}, **(ended or {})})
     return path
+
+
+def _by(commander: str, sample: Sample) -> Sample:
+    """A task is of this process."""
+    if sample.key != KEYS.task or sample.header is None:
+        return sample
+    return replace(sample, header=replace(sample.header, source=commander))
 
 
 def _command(cause: Cause | None, at_ms: float) -> Sample:

@@ -329,6 +329,7 @@ def test_at_a_lower_speed_override_a_worker_may_send_as_few_chunks_as_are_asked_
 # -- camera -----------------------------------------------------------------------------------
 CAMERA = replace_camera(load_profile("panda_sim"), depth_unit_m=0.001, jpeg_width=320)
 RAW, JPEG, DEPTH = (f"camera/front/{kind}" for kind in ("raw", "jpeg", "depth"))
+STATUS = "status/camera"
 IMAGES = 30
 
 
@@ -339,7 +340,13 @@ def image_of(key: str, shade: int) -> Image | Depth:
     return Image(np.full(size, shade, np.uint8))
 
 
+def camera_status(detail: dict[str, Any]) -> Arrived:
+    status = NodeStatus("camera", "running", "here", 1, AT_NS, {}, {}, {}, {}, detail)
+    return Arrived(STATUS, AT_NS, Header(AT_NS, 0, "camera#1"), status)
+
+
 def camera_samples() -> Iterator[Arrived]:
+    yield camera_status({"cameras": {"front": {"age_s": 0.01}}})
     for seq in range(IMAGES):
         stamp_ns = AT_NS + seq * 10**9 // IMAGES
         for key in (RAW, JPEG, DEPTH):
@@ -351,6 +358,8 @@ def frozen_but(changing: set[int]) -> Change:
     """Its images change at these numbers only."""
 
     def change(sample: Arrived) -> Arrived:
+        if sample.key == STATUS:
+            return sample
         shade = max((at for at in changing if at <= number(sample)), default=100)
         return replace(sample, record=image_of(sample.key, shade))
 
@@ -366,6 +375,14 @@ CAMERAS: dict[str, tuple[Change, set[str]]] = {
     "a third of the rate": (
         of(RAW)(lambda s: s if number(s) % 3 == 0 else None),
         {f"{RAW}: rate"},
+    ),
+    "a status without the age of its images": (
+        of(STATUS)(lambda s: replace(s, record=replace(s.record, detail={}))),
+        {"status: age of its images"},
+    ),
+    "an age that is no number": (
+        of(STATUS)(lambda s: camera_status({"cameras": {"front": {"age_s": "new"}}})),
+        {"status: age of its images"},
     ),
     "no JPEG": (lambda s: None if s.key == JPEG else s, {f"{JPEG}: rate"}),
     "no depth, which the profile declares": (
@@ -414,8 +431,7 @@ def test_a_camera_without_depth_in_the_profile_is_not_asked_for_it() -> None:
 def test_a_camera_without_images_is_quoted_with_what_its_status_says() -> None:
     why = "an image of type int64 cannot be shown"
     detail = {"cameras": {"front": {"why": why}}}
-    status = NodeStatus("camera", "degraded", "here", 1, AT_NS, {}, {}, {}, {}, detail)
-    said = Arrived("status/camera", AT_NS, Header(AT_NS, 0, "camera#1"), status)
+    said = camera_status(detail)
     found = list(rules.camera(Seen("camera", [said], 1.0, clocks=[CLOCK]), "front", CAMERA))
     assert broken(found) == {f"{key}: rate" for key in (RAW, JPEG, DEPTH)}
     assert all(why in each.text for each in found if each.right is False)

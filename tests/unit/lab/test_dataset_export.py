@@ -628,7 +628,7 @@ def test_a_camera_that_only_some_recordings_have_is_left_out_with_a_word(
 ) -> None:
     runs = tmp_path / "runs of today"
     make_run(runs / "one" / "up.mcap", prompts=PROMPTS[:1], cameras=("front", "wrist"))
-    make_run(runs / "two" / "up.mcap", prompts=PROMPTS[:1])
+    make_run(runs / "two" / "up.mcap", prompts=PROMPTS[:1], commander="command#2")
     words = ("export", str(runs), "-o", str(tmp_path / "out"), "--json")
     done = typed(capsys, "dataset", *words)
     assert done.code == 0, done.stderr
@@ -657,6 +657,54 @@ def recorded_joints(run: Run, **position_rad: float) -> Run:
 def states(folder: Path) -> np.ndarray:
     rows = pq.read_table(next((folder / "data").rglob("*.parquet")))
     return np.array(rows.column("observation.state").to_pylist())
+
+
+def test_an_episode_that_is_in_two_recordings_is_exported_once_from_the_one_that_has_it_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = tmp_path / "saved"
+    make_run(runs / "a.mcap", until_ms=4000)
+    make_run(runs / "b.mcap")
+    make_run(runs / "c.mcap", commander="command#2")
+    done = typed(capsys, "dataset", "export", str(runs), "-o", str(tmp_path / "out"), "--json")
+    assert done.code == 0, done.stderr
+    made = json.loads(done.stdout)
+    assert made["episodes"] == 2 * len(PROMPTS)
+    assert made["frames"] == 2 * len(PROMPTS) * CHUNKS * USED
+    whole, cut = sorted(made["left_out"], key=lambda why: "at 3.0 s" in why)
+    assert "at 0.5 s is in" in whole
+    assert "a.mcap: the episode at 3.0 s is in" in cut
+    assert "b.mcap as well, and is taken from there" in cut
+
+
+def test_an_episode_that_a_recording_ended_before_is_no_failure(tmp_path: Path) -> None:
+    for until_ms, over in ((4000.0, False), (6000.0, True)):
+        run = load_run(make_run(tmp_path / f"{until_ms}.mcap", until_ms=until_ms))
+        assert [episode.is_over for episode in episodes_of(run)] == [True, over]
+
+
+def test_recordings_of_two_robots_do_not_become_one_dataset(tmp_path: Path) -> None:
+    other = load_profile("panda_sim")
+    names = [f"left_{name}" for name in other.robot.arm_joints]
+    robot = other.robot.model_copy(update={"arm_joints": tuple(names)})
+    text = to_yaml(other.model_copy(update={"robot": robot}))
+    runs = [
+        load_run(make_run(tmp_path / "panda.mcap", prompts=PROMPTS[:1])),
+        load_run(make_run(tmp_path / "left.mcap", prompts=PROMPTS[:1], profile_yaml=text)),
+    ]
+    episodes = [episode for run in runs for episode in episodes_of(run)]
+    with pytest.raises(RecordingError, match=r"panda.mcap and .*left.mcap are of different robots"):
+        export(tmp_path / "out", episodes, ["front"], PARTS)
+
+
+def test_without_images_an_episode_whose_camera_was_not_recorded_is_exported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_run(tmp_path / "up.mcap", prompts=PROMPTS[:1])
+    words = ("export", str(run), "-o", str(tmp_path / "out"), "--no-images", "--json")
+    done = typed(capsys, "dataset", *words)
+    assert done.code == 0, done.stderr
+    assert json.loads(done.stdout)["cameras"] == []
 
 
 def test_joints_that_were_recorded_in_another_order_are_in_the_columns_of_their_names(

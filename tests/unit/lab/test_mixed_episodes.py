@@ -154,7 +154,7 @@ def test_episodes_are_chosen_by_their_label_and_discarded_ones_only_where_they_a
     runs = tmp_path / "runs"
     for verdict in ("success", "failure", "void"):
         fact = {FACT: {"worker": "teleop", "verdict": verdict, "note": ""}}
-        write_mixed_run(runs / f"{verdict}.mcap", ended=fact)
+        write_mixed_run(runs / f"{verdict}.mcap", ended=fact, commander=f"command#{verdict}")
 
     def exported(*words: str) -> list[str]:
         out = tmp_path / f"out{len(list(tmp_path.iterdir()))}"

@@ -31,7 +31,8 @@ def test_only_what_a_person_called_a_success_is_exported_where_that_is_asked(
     """The prompt is no task that a program can judge."""
     verdicts: tuple[Verdict, ...] = ("failure", "success")
     for verdict in verdicts:
-        write_run(tmp_path / f"{verdict}.mcap", prompts=PROMPTS[:1], ended=fact(verdict))
+        path, commander = tmp_path / f"{verdict}.mcap", f"command#{verdict}"
+        write_run(path, prompts=PROMPTS[:1], ended=fact(verdict), commander=commander)
     (episode,) = episodes_of(load_run(tmp_path / "success.mcap"))
     assert succeeded(episode) is True
     for ended, known in (

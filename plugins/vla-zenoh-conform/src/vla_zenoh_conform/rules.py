@@ -398,13 +398,18 @@ def camera(seen: Seen, name: str, profile: Profile) -> Iterator[RuleFinding]:
 
 
 def _age(seen: Seen, name: str) -> RuleFinding:
-    """Whether the status says how old the newest image is, which every activation needs."""
+    """Whether the status says how old the newest image is, or why there is none: without it nothing
+    that needs the camera is activated."""
     told = [status.detail.get("cameras") for status in _records(seen, f"status/{seen.node}")]
-    fields = [cameras.get(name) for cameras in told if isinstance(cameras, Mapping)]
-    ages_s = [each.get("age_s") for each in fields if isinstance(each, Mapping)]
-    text = f"detail.cameras.{name}.age_s in {len(ages_s)} of {len(told)}"
-    right = bool(told) and all(isinstance(age_s, int | float) for age_s in ages_s)
-    return RuleFinding("status: age of its images", right and len(ages_s) == len(told), text)
+    fields = [cameras.get(name) if isinstance(cameras, Mapping) else None for cameras in told]
+    right = [isinstance(each, Mapping) and _says_age(each) for each in fields]
+    text = f"detail.cameras.{name}.age_s in {sum(right)} of {len(told)} statuses"
+    return RuleFinding("status: age of its images", bool(told) and all(right), text)
+
+
+def _says_age(fields: Mapping[str, Any]) -> bool:
+    age_s = fields.get("age_s")
+    return isinstance(age_s, int | float) or (age_s is None and bool(fields.get("why")))
 
 
 def _images(seen: Seen, key: str, rate_hz: float, wanted: tuple[int, int]) -> Iterator[RuleFinding]:

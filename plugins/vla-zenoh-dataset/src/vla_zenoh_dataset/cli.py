@@ -32,6 +32,7 @@ def export(
         list[str] | None,
         typer.Option("--camera", help="Only this camera; repeatable. Default: all recorded ones."),
     ] = None,
+    images: Annotated[bool, typer.Option(help="Images of cameras.")] = True,
     depth: Annotated[
         bool,
         typer.Option(
@@ -71,7 +72,7 @@ def export(
     from vla_zenoh_policy_servers.state_vector import read_parts
 
     from vla_zenoh.lab.recording.run import load_run
-    from vla_zenoh_dataset.episodes import episodes_of
+    from vla_zenoh_dataset.episodes import episodes_of, without_copies
     from vla_zenoh_dataset.features import usual_state
     from vla_zenoh_dataset.lerobot import export as write
     from vla_zenoh_dataset.success import succeeded, verdict_of_person
@@ -80,7 +81,7 @@ def export(
     if not files:
         raise RecordingError(f"no {MCAP} file in {', '.join(map(str, runs))}")
     wanted = labels or [each for each in EpisodeLabel if each is not EpisodeLabel.DISCARDED]
-    episodes, workers, left_out = list[RecordedEpisode](), set[str](), Counter[str]()
+    episodes, workers = list[RecordedEpisode](), set[str]()
     with (
         output_folder(output, force=force, inputs=files) as part,
         progress("reading the recordings") as status,
@@ -95,14 +96,16 @@ def export(
             for episode in found:
                 episode.success = succeeded(episode)
                 episode.discarded = verdict_of_person(episode) == "void"
-            episodes += [each for each in found if each.label in wanted]
-            left_out.update(each.label for each in found if each.label not in wanted)
+            episodes += found
         if worker is not None and worker not in workers:
             known = ", ".join(sorted(workers)) or "none"
             fail(
                 f"no episode of worker {worker!r} is in the recordings{nearest(worker, workers)} "
                 f"Workers there: {known}"
             )
+        episodes, copies = without_copies(episodes)
+        left_out = Counter(each.label for each in episodes if each.label not in wanted)
+        episodes = [each for each in episodes if each.label in wanted]
         if left_out and not episodes:
             those = ", ".join(f"{count} {label}" for label, count in left_out.items())
             fail(
@@ -111,7 +114,7 @@ def export(
             )
         runs_used = list({id(each.run): each.run for each in episodes}.values())
         pictures = {str(run.path): set(run.picture_counts) for run in runs_used}
-        wanted_cameras = cameras or in_all(pictures, "images")
+        wanted_cameras = (cameras or in_all(pictures, "images")) if images else []
         depths = {str(run.path): run.depth_cameras & {*wanted_cameras} for run in runs_used}
         written = write(
             part,
@@ -122,7 +125,7 @@ def export(
             in_all(depths, "depth images") if depth else [],
             rotation=rotation,
         )
-    written = written._replace(folder=output)
+    written = written._replace(folder=output, left_out=(*copies, *written.left_out))
     for gap in written.left_out:
         warn(f"left out: {gap}")
     if as_json:

@@ -88,6 +88,18 @@ class RecordedEpisode:
         """Which one it is, in words: when it began, of which recording."""
         return f"{self.run.path}: the episode at {self.after_s(self.since_ns):.1f} s"
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the recording has its end, rather than ending before."""
+        return self.run.tasks[-1].header.stamp_wall_ns >= self.until_ns
+
+    def is_copy_of(self, other: RecordedEpisode) -> bool:
+        """Whether both are of one robot at one time: by the process that commanded it."""
+        one, two = (newest(each.run.tasks, each.since_ns) for each in (self, other))
+        if one is None or two is None or one.header.source != two.header.source:
+            return False
+        return self.since_ns < other.until_ns and other.since_ns < self.until_ns
+
     def after_s(self, at_ns: int) -> float:
         """Seconds from the beginning of the recording to a time, wall clock."""
         return (at_ns - self.run.began_ns) / 1e9
@@ -147,6 +159,28 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
         if worker in (None, whose):
             out.append(_episode(run, whose, led, carried_out, people))
     return [episode for episode in out if episode.frames]
+
+
+def without_copies(
+    episodes: Sequence[RecordedEpisode],
+) -> tuple[list[RecordedEpisode], list[str]]:
+    """Each episode once, and which were left out: recordings overlap where two recorders ran, or a
+    rolling record was saved twice. A copy with a label is kept, of those the longest, and of those one
+    of a finished recording."""
+    kept: list[RecordedEpisode] = []
+    copies: list[str] = []
+
+    def merit(each: RecordedEpisode) -> tuple[bool, int, bool]:
+        unfinished = each.run.file.ended is None
+        return each.label == EpisodeLabel.UNKNOWN, -len(each.frames), unfinished
+
+    for episode in sorted(episodes, key=merit):
+        same = next((each for each in kept if each.is_copy_of(episode)), None)
+        if same is None:
+            kept.append(episode)
+        else:
+            copies.append(f"{episode.named} is in {same.run.path} as well, and is taken from there")
+    return [each for each in episodes if any(each is one for one in kept)], copies
 
 
 def _people(run: Run) -> set[str]:

@@ -341,6 +341,26 @@ def numbers_of(episode: RecordedEpisode, parts: Sequence[str]) -> dict[str, Stat
     return out
 
 
+def check_one_robot(episodes: Sequence[RecordedEpisode]) -> None:
+    """All recordings are of the same joints, whatever is exported of them.
+
+    Raises:
+        RecordingError: they are not; names two of them.
+    """
+    for part in episodes[0].spec.parts:
+        arms = {
+            str(each.run.path): each.run.of_part(part).profile.robot.arm_joints for each in episodes
+        }
+        (first, joints), *others = arms.items()
+        other = next((name for name, own in others if {*own} != {*joints}), None)
+        if other is not None:
+            raise RecordingError(
+                f"{first} and {other} are of different robots: their joints are "
+                f"{', '.join(joints)}, and {', '.join(arms[other])}; export the recordings of each "
+                "robot by themselves"
+            )
+
+
 def check_gripper_widths(episodes: Sequence[RecordedEpisode], names: Sequence[str]) -> None:
     """A share of an open gripper is the same width in all recordings.
 

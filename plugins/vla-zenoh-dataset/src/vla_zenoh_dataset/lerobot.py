@@ -34,6 +34,7 @@ from vla_zenoh_dataset.features import (
     action_names,
     actions_of,
     check_gripper_widths,
+    check_one_robot,
     check_never_turns,
     joined,
     kept_columns,
@@ -111,7 +112,7 @@ def export(
 
     Raises:
         RecordingError: the folder is not empty; there are no episodes; their actions differ in
-            meaning, or their grippers in width; none was recorded without a gap; they turn the
+            meaning, their robots in joints, or their grippers in width; none was recorded without a gap; they turn the
             hand, and `rotation` is False.
     """
     if not episodes:
@@ -121,6 +122,7 @@ def export(
         raise RecordingError(
             f"the actions of the workers {whose} do not mean the same; choose one with --worker"
         )
+    check_one_robot(episodes)
     check_gripper_widths(episodes, parts)
     if not rotation:
         check_never_turns(episodes)
@@ -138,7 +140,7 @@ def export(
     if not whole:
         raise RecordingError(
             f"no episode was recorded without a gap: {gaps[0]}. Leave what is missing out with "
-            "--camera or --state"
+            "--camera, --no-images or --state"
         )
     seen = [kept[index] for index in whole], [*whole.values()], numbers
     made = _Dataset(folder, seen, cameras, parts, depth, rotation=rotation)

@@ -26,7 +26,8 @@ def succeeded(episode: RecordedEpisode) -> bool | None:
     """The verdict of a person, else that of the true poses; None if unknown.
 
     It is unknown if the person called the episode void, or if there is no verdict of a person and
-    the prompt changed or is no known task, or no true poses were recorded.
+    the prompt changed or is no known task, no true poses were recorded, or the recording ended
+    before the episode did.
     """
     said = verdict_of_person(episode)
     if said is not None:
@@ -54,4 +55,6 @@ def succeeded(episode: RecordedEpisode) -> bool | None:
         verdict = judge.update(entry.record, width.record.opening_m, time_s, pose.record.position_m)
         if verdict is not None:
             break
+    if verdict is None and not episode.is_over:
+        return None
     return (verdict or judge.end()).success

@@ -111,6 +111,8 @@ class Recording:
                 if set_ns:
                     entry = replace(entry, received_ns=entry.received_ns + set_ns)
                 yield order.take(entry)
+            if self.ended is None:
+                self._note_damage("not finished: its recorder still runs, or was killed")
             for what, counts in missing.items():
                 counts.update(self._missing(what))
         if self.ended is not None:
