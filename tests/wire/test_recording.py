@@ -246,6 +246,15 @@ def test_a_replay_ends_when_a_robot_comes_to_life(run_file: Path, chain: Chain) 
     assert "robot 'sleeper' is alive (command)" in found[0].failure
 
 
+def test_a_recorder_of_any_name_keeps_no_replay_from_its_robot(
+    run_file: Path, chain: Chain
+) -> None:
+    ghost = ghost_of(chain, "heard")
+    token = chain.session.liveliness().declare_token(ghost.keys.alive("evening"))
+    Replay(ghost, chain.session, open_recording(run_file))
+    token.undeclare()
+
+
 def test_only_pictures_may_be_replayed_beside_a_live_robot(run_file: Path, chain: Chain) -> None:
     ghost = ghost_of(chain, "blind")
     token = chain.session.liveliness().declare_token(ghost.keys.alive("command"))

@@ -11,7 +11,7 @@ import pytest
 from dataset_rig import PROMPTS, write_run
 from typed import typed
 from vla_zenoh_dataset.episodes import episodes_of
-from vla_zenoh_dataset.success import succeeded
+from vla_zenoh_dataset.success import succeeded, verdict_of_person
 from vla_zenoh_trial.verdict import EpisodeVerdict
 
 from vla_zenoh.lab.recording.run import load_run
@@ -53,3 +53,13 @@ def test_only_what_a_person_called_a_success_is_exported_where_that_is_asked(
     table = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet")
     assert table["run"].to_pylist() == ["success.mcap"]
     assert table["success"].to_pylist() == [True]
+
+
+def test_an_episode_whose_trial_was_killed_before_the_verdict_is_void(tmp_path: Path) -> None:
+    trials = tmp_path / "trials.jsonl"
+    trials.write_text("")
+    path = write_run(tmp_path / "episode-0002.mcap", prompts=PROMPTS[:1])
+    (episode,) = episodes_of(load_run(path))
+    assert verdict_of_person(episode) == "void"
+    trials.unlink()
+    assert verdict_of_person(episode) is None

@@ -165,8 +165,8 @@ def without_copies(
     episodes: Sequence[RecordedEpisode],
 ) -> tuple[list[RecordedEpisode], list[str]]:
     """Each episode once, and which were left out: recordings overlap where two recorders ran, or a
-    rolling record was saved twice. A copy with a label is kept, of those the longest, and of those one
-    of a finished recording."""
+    rolling record was saved twice. A copy with a label is kept, of those the longest, and of those
+    one of a finished recording."""
     kept: list[RecordedEpisode] = []
     copies: list[str] = []
 

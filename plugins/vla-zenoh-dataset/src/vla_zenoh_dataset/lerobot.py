@@ -34,8 +34,8 @@ from vla_zenoh_dataset.features import (
     action_names,
     actions_of,
     check_gripper_widths,
-    check_one_robot,
     check_never_turns,
+    check_one_robot,
     joined,
     kept_columns,
     names_of_state,
@@ -112,8 +112,8 @@ def export(
 
     Raises:
         RecordingError: the folder is not empty; there are no episodes; their actions differ in
-            meaning, their robots in joints, or their grippers in width; none was recorded without a gap; they turn the
-            hand, and `rotation` is False.
+            meaning, their robots in joints, or their grippers in width; none was recorded without a
+            gap; they turn the hand, and `rotation` is False.
     """
     if not episodes:
         raise RecordingError("the recordings hold no episode: no chunk was executed in them")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.lab.recording.run import newest
-from vla_zenoh.lab.recording.verdict import Verdict, verdict_in
+from vla_zenoh.lab.recording.verdict import FACT, TRIALS, Verdict, verdict_in
 from vla_zenoh.lab.tasks.judge import SETTLED_S, judge_of
 from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh_dataset.episodes import RecordedEpisode
@@ -14,12 +14,17 @@ AFTER_NS = int(1.2 * SETTLED_S * 1e9)
 
 
 def verdict_of_person(episode: RecordedEpisode) -> Verdict | None:
-    """Of the operator, on any worker that led the arm in it; None: there is none."""
+    """Of the operator, on any worker that led the arm in it; None: there is none.
+
+    An episode of a trial that was killed before the verdict is void: the trial repeats it.
+    """
+    ended = episode.run.file.ended
     for worker in (episode.worker, *episode.workers):
-        verdict = verdict_in(episode.run.file.ended, worker)
+        verdict = verdict_in(ended, worker)
         if verdict is not None:
             return verdict
-    return None
+    path = episode.run.path
+    return "void" if (path.parent / TRIALS).exists() and FACT not in (ended or {}) else None
 
 
 def succeeded(episode: RecordedEpisode) -> bool | None:

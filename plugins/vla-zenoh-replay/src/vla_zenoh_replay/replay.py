@@ -21,7 +21,7 @@ from vla_zenoh.bus.session import alive_nodes
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, NodeError, ProfileError, RecordingError, in_words
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import NODE_KINDS, Keys
 from vla_zenoh.lab.recording.reader import Recording
 from vla_zenoh.lab.recording.record_types import group_of
 from vla_zenoh.lab.recording.sample import JPEG, Sample, stamps_moved
@@ -102,8 +102,8 @@ QOS: dict[str, Any] = {
     "priority": zenoh.Priority.DATA,
     "express": True,
 }
-_BYSTANDERS = ("worker-", "camera", "recorder", "router", NAME)
-"""Prefixes of nodes that neither are a robot nor move one."""
+_ROBOT = tuple(kind for kind, traits in NODE_KINDS.items() if traits.role in ("robot", "command"))
+"""Prefixes of nodes that are a robot or move one."""
 
 
 @dataclass(slots=True)
@@ -173,7 +173,7 @@ class Replay:
             self._link_lost = True
 
     def _reject_live_robot(self) -> None:
-        live = sorted(name for name in list(self._alive) if not name.startswith(_BYSTANDERS))
+        live = sorted(name for name in list(self._alive) if name.startswith(_ROBOT))
         if live and self._groups != {CAMERAS}:
             raise NodeError(
                 f"robot {self._there.robot!r} is alive ({', '.join(live)}): a replay would command "

@@ -21,12 +21,13 @@ from pydantic import TypeAdapter, ValidationError
 
 from vla_zenoh.errors import RecordingError, describe_faults
 from vla_zenoh.lab.durable import append_lines, lock_folder, whole_lines, write_whole, writing
+from vla_zenoh.lab.recording.verdict import TRIALS
 from vla_zenoh_trial.plan import TrialPlan
 from vla_zenoh_trial.verdict import EpisodeVerdict
 
 EPISODES, SECONDS = 20, 60.0
 """Of a plan that does not say them."""
-PLAN, TRIALS = "plan.json", "trials.jsonl"
+PLAN = "plan.json"
 _RECORDING = re.compile(r"episode-(\d+)\.mcap")
 
 

@@ -9,6 +9,8 @@ Verdict = Literal["success", "failure", "void"]
 """A void episode does not count, and is repeated."""
 FACT = "trial"
 """Name of the verdict in the metadata at the end of a recording."""
+TRIALS = "trials.jsonl"
+"""File of all verdicts of a trial, in the folder of its recordings."""
 
 
 def verdict_in(metadata: Mapping[str, Any] | None, worker: str) -> Verdict | None:
