@@ -173,3 +173,16 @@ def test_a_node_that_fails_before_it_activates_does_not_activate(
             ended.result(10.0)
         until("it is deactivated", lambda: activations)
         assert set(activations) == {"false"}
+
+
+def test_what_a_person_has_chosen_meanwhile_stays_after_a_primitive() -> None:
+    with running(ARM) as (node, client, _):
+        robot = node._robot
+        for chosen, afterwards in ((PRIMITIVES, "scripted"), ("teleop", "teleop")):
+            with node._settings_kept(PRIMITIVES, None):
+                client.set_worker(PRIMITIVES)
+                client.set_worker(chosen)
+                until("it is chosen", lambda w=chosen: robot.task and robot.task.worker == w)
+            time.sleep(0.1)
+            assert robot.task is not None
+            assert robot.task.worker == afterwards

@@ -206,10 +206,11 @@ class PrimitivesNode:
         failed = "rejected"
         try:
             ending, target = self._prepare(request)
-            with self._settings_kept(), self._stands_after():
+            run = request if isinstance(request, RunModel) else None
+            worker, prompt = run.worker if run else PRIMITIVES, run and run.prompt
+            with self._settings_kept(worker, prompt), self._stands_after():
                 self._aim(target)
-                run = request if isinstance(request, RunModel) else None
-                self._activate(run.worker if run else PRIMITIVES, run and run.prompt, request)
+                self._activate(worker, prompt, request)
                 failed = "ended"
                 reason, why = self._watch(ending, asked.since_s + request.timeout_s)
             if isinstance(request, Grip) and reason == "reached":
@@ -339,16 +340,19 @@ class PrimitivesNode:
         )
 
     @contextmanager
-    def _settings_kept(self) -> Iterator[None]:
-        """Restores worker and prompt afterwards."""
+    def _settings_kept(self, worker: str, prompt: str | None) -> Iterator[None]:
+        """Restores both afterwards, unless somebody has chosen another one meanwhile."""
         robot, before = self._robot, self._robot.task
         try:
             yield
         finally:
             with suppress(SessionError):  # if the command node is gone, so are they
-                if before is not None:
-                    robot.set_worker(before.worker)
-                    robot.set_prompt(before.prompt)
+                now = robot.task
+                if before is not None and now is not None:
+                    if now.worker in (worker, before.worker):
+                        robot.set_worker(before.worker)
+                    if now.prompt in (prompt, before.prompt):
+                        robot.set_prompt(before.prompt)
 
     @contextmanager
     def _stands_after(self) -> Iterator[None]:
