@@ -143,7 +143,8 @@ class Browser:
     def hold(self) -> None:
         until("a tick", lambda: self._tick)
         self._press += 1
-        self.send(do="hold", press=self._press, tick=self._tick)
+        hand = any(self.twist) or bool(self.opening)
+        self.send(do="hold", press=self._press, tick=self._tick, hand=hand)
         self._holding.set()
 
     def hold_until_active(self, patience_s: float) -> None:

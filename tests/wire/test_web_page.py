@@ -223,6 +223,25 @@ def test_only_one_page_holds(chain: Chain, site: Site) -> None:
         one.let_go()
 
 
+def test_no_other_page_changes_how_the_arm_moves_under_a_finger(chain: Chain, site: Site) -> None:
+    def jog(browser: Browser, *, on: bool, level: int) -> dict[str, Any]:
+        return browser.ask(do="jog", on=on, frame="base", level=level, part="")
+
+    with browsing(site) as one, browsing(site) as other:
+        assert jog(one, on=True, level=3)["is"] == "done"
+        one.twist = [0.0, 0.0, 1.0 if chain.height_m() < 0.42 else -1.0, 0.0, 0.0, 0.0]
+        hold_until_it_moves(chain, one)
+        for answer in (jog(other, on=True, level=4), jog(other, on=False, level=0)):
+            assert "another page holds the arm" in answer["why"]
+        assert other.state["hand"]["level"] == 3
+        assert other.state["task"]["worker"] == "teleop"
+        other.send(do="stop")
+        assert one.wait("stopped")["outcome"] == "confirmed"
+        one.let_go()
+        assert other.ask(do="reset")["is"] == "done"
+        assert jog(other, on=False, level=0)["is"] == "done"
+
+
 def test_an_activation_is_rejected_with_every_reason_in_words(chain: Chain, site: Site) -> None:
     with browsing(site) as browser:
         assert browser.ask(do="prompt", text="dance")["is"] == "done"
@@ -461,8 +480,8 @@ def test_garbage_moves_nothing_and_ends_nothing(chain: Chain, site: Site) -> Non
         '{"do": "prompt", "text": "\\ud800"}', '{"do": "rate", "hz": NaN}',
         '{"do": "rate", "hz": ' + "9" * 3000 + "}", "[" * 4000,
         '{"do": "beat", "press": 1, "tick": 1e400, "twist": [9,0,0,0,0,0], "opening": 0}',
-        '{"do": "hold", "press": -1, "tick": 0}',
-        '{"do": "hold", "press": 1, "tick": 9007199254740991}',
+        '{"do": "hold", "press": -1, "tick": 0, "hand": false}',
+        '{"do": "hold", "press": 1, "tick": 9007199254740991, "hand": false}',
         '{"do": "look", "streams": ["../x"], "hz": 1}', '{"do": "enter", "token": "x"}',
     ]  # fmt: skip
     with browsing(site) as browser:

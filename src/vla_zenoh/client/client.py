@@ -630,7 +630,7 @@ class Client(StopClient):
         """Deactivate the arm; True if it stands within `timeout_s`."""
         began_s = time.monotonic()
         self.publish(self.keys.active, "false")
-        stands = bool(self.wait_for(lambda: self._stands(began_s), timeout_s))
+        stands = bool(self.wait_for(lambda: self.stands(began_s), timeout_s))
         self.release_deadman()
         return stands
 
@@ -641,7 +641,7 @@ class Client(StopClient):
         if token is not None:
             token.undeclare()
 
-    def _stands(self, since_s: float) -> bool:
+    def stands(self, since_s: float) -> bool:
         """Whether the arm stands, by a status that is newer than the command."""
         status = self.status_since("command", since_s)
         if status is None or status.state in ("active", "holding"):

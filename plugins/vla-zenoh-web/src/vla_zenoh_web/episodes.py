@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,15 @@ class Episodes:
     """The guide at a robot. Its methods may be called from several threads."""
 
     def __init__(
-        self, profile: Profile, client: Client, recordings: Recordings, runs: Path = RUNS
+        self,
+        profile: Profile,
+        client: Client,
+        recordings: Recordings,
+        brake: Callable[[], object],
+        runs: Path = RUNS,
     ) -> None:
         self._profile, self._client, self._recordings = profile, client, recordings
-        self._runs, self._folder = runs, runs
+        self._brake, self._runs, self._folder = brake, runs, runs
         self._guide, self._lock = EpisodeGuide(), threading.Lock()
 
     @property
@@ -82,7 +88,7 @@ class Episodes:
                 guide.take()
             case "end":
                 guide.end()
-                self._client.deactivate()
+                self._brake()
             case "finish":
                 guide.finish()
                 self._export_when_due()

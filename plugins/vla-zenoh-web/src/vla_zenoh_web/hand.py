@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import zenoh
 from vla_zenoh_teleop.policy import OperatorInput, TeleopPolicy, speeds_of
@@ -45,6 +46,11 @@ class HandWorker:
         """Whether the arm follows this worker."""
         task = self._client.task
         return self._thread is not None and task is not None and task.worker == TELEOP
+
+    @property
+    def chosen(self) -> dict[str, Any]:
+        """What every page shows, whichever chose it."""
+        return {"frame": self._frame, "level": self._level, "part": self.parts[self._part]}
 
     def take(self, frame: Frame, level: int, part: str) -> Task:
         """Select this worker, to move `part`; it starts, or again with other axes.

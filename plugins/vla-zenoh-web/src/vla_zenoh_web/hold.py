@@ -58,9 +58,14 @@ class Hold:
         self.held = held._replace(until_s=max(held.until_s, _until_s(tick_ms, now_s)))
         return True
 
-    def release(self, page: int) -> None:
-        """End the hold of a page, if it has it."""
-        if self.held is not None and self.held.page == page:
+    def holds(self, page: int, press: int | None = None) -> bool:
+        """Whether the hold in force is of this page, and of this press of it."""
+        held = self.held
+        return held is not None and held.page == page and press in (None, held.press)
+
+    def release(self, page: int, press: int | None = None) -> None:
+        """End the hold of a page, if it has it; of a press: no newer one."""
+        if self.holds(page, press):
             self.held = None
 
     def forget(self, page: int) -> None:

@@ -42,32 +42,36 @@ class SettingRequest(PageRequest):
     """Changes the robot, and waits for its confirmation."""
 
 
+class MotionRequest(SettingRequest):
+    """Changes how the arm moves: not while another page holds it."""
+
+
 class ResetRequest(SettingRequest):
     pass
 
 
-class PromptRequest(SettingRequest):
+class PromptRequest(MotionRequest):
     text: Text
 
 
-class WorkerRequest(SettingRequest):
+class WorkerRequest(MotionRequest):
     name: Text
 
 
-class RateRequest(SettingRequest):
+class RateRequest(MotionRequest):
     hz: Number
 
 
-class SpeedRequest(SettingRequest):
+class SpeedRequest(MotionRequest):
     percent: Number
 
 
-class HeldRequest(SettingRequest):
+class HeldRequest(MotionRequest):
     part: Text
     text: Text
 
 
-class ActivateRequest(SettingRequest):
+class ActivateRequest(MotionRequest):
     pass
 
 
@@ -83,7 +87,9 @@ class PressRequest(PageRequest):
 
 
 class HoldRequest(PressRequest):
-    pass
+    """`hand`: a button that moves the arm by hand; no model is to move it in its place."""
+
+    hand: bool
 
 
 class PrimitivePress(PressRequest, tag="primitive"):
@@ -101,7 +107,7 @@ class ReleaseRequest(PageRequest):
     pass
 
 
-class JogRequest(SettingRequest):
+class JogRequest(MotionRequest):
     on: bool
     frame: Literal["base", "tcp"]
     level: Level

@@ -41,6 +41,12 @@ from vla_zenoh_web.recordings import Recordings
 STAND_S, STAND_POLL_S = 3.0, 0.01
 WATCH_S = 0.05
 MAX_HOLDER = 48
+MOVING = ("begin", "scene")
+"""Steps of the guide that change the prompt, or the simulated scene."""
+NOT_YOURS = (
+    "another page holds the arm: only that page changes how it moves. STOP and Deactivate are for "
+    "everyone"
+)
 FORCE = "external_force_n"
 SPECS = 64
 
@@ -70,12 +76,15 @@ class RobotLink:
         self._short: dict[str, str] = {}
         self._seen: dict[str, list[str]] = {}
         self._hold, self._let_go, self._confirmed = Hold(), False, False
+        self._run: tuple[int, int] | None = None
+        """Page and press for which the arm was activated last, until it is inactive."""
         self._hold_lock, self._activating = threading.Lock(), threading.Lock()
+        self._ending = threading.Lock()
         self._wake, self._closed = threading.Event(), threading.Event()
         self._hand = OperatorInput()
         self.hand = HandWorker(profile, self.client, self._read_hand)
         self.recordings = Recordings(profile, session)
-        self.episodes = Episodes(profile, self.client, self.recordings)
+        self.episodes = Episodes(profile, self.client, self.recordings, self.deactivate)
         self._watcher = threading.Thread(target=self._watch_hold, name="hold", daemon=True)
         self._watcher.start()
 
@@ -183,6 +192,7 @@ class RobotLink:
             "done": detail.get("policy_done", False),
             "task": None if task is None else asdict(task),
             "jog": self.hand.has_arm,
+            "hand": self.hand.chosen,
             "primitives": worker_node(PRIMITIVES) in self.client.alive,
             "rolling": ROLLING in self.client.alive,
             "seen": [] if task is None else self._seen.get(task.worker, []),
@@ -224,8 +234,28 @@ class RobotLink:
             "at_ms": time.time_ns() // 1_000_000,
         }
 
-    def set(self, asked: requests.Changes) -> Any:
-        """Change a setting, and wait for the robot's confirmation."""
+    def set(self, page: int, asked: requests.Changes) -> Any:
+        """Change a setting, and wait for the robot's confirmation.
+
+        Raises:
+            SessionError: another page holds the arm, which would move in another way.
+        """
+        moves = isinstance(asked, requests.MotionRequest)
+        if not (moves or (isinstance(asked, requests.GuideRequest) and asked.step in MOVING)):
+            return self._set(asked)
+        self._require_free(page)  # before it waits: a primitive of the other may take long
+        with self._activating:
+            self._require_free(page)
+            return self._set(asked)
+
+    def _require_free(self, page: int) -> None:
+        with self._hold_lock:
+            self._hold.expire(time.monotonic())
+            held = self._hold.held
+        if held is not None and held.page != page:
+            raise SessionError(NOT_YOURS)
+
+    def _set(self, asked: requests.Changes) -> Any:
         match asked:
             case requests.PromptRequest():
                 return self.client.set_prompt(asked.text)
@@ -263,49 +293,65 @@ class RobotLink:
         """
         with self._hold_lock:
             why = self._hold.press(page, press, tick_ms, time.monotonic())
-            self._hand = OperatorInput()
+            if not why:
+                self._hand = OperatorInput()
         if why:
             raise SessionError(why)
 
-    def activate_held(self, page: int, name: str) -> Task:
-        """Activate the arm for as long as this page holds; waits until it is active.
+    def activate_held(self, page: int, asked: requests.HoldRequest, name: str) -> Task:
+        """Activate the arm for as long as this press lasts; waits until it is active.
 
         Raises:
             SessionError: rejected, with every reason, or let go meanwhile.
         """
+        press = asked.press
         with self._activating:
-            if not self.holds(page):
-                raise SessionError("let go before the arm was active")
-            self._confirmed = False
+            self._await_turn(page, press)
+            with self._ending:
+                self._run, self._confirmed = (page, press), False
             try:
+                if asked.hand and not self.hand.has_arm:
+                    raise SessionError("the arm is not moved by hand any more: take it again")
                 task = self.client.activate_with_deadman(f"web-{name}"[:MAX_HOLDER])
             except VlaZenohError:
-                self.release(page)
+                self.release(page, press)
                 raise
-            self._confirmed = True
+            with self._ending:
+                self._confirmed = True
             return task
 
-    def primitive(self, page: int, name: str, what: str) -> str:
-        """Go home, open or close the gripper, for as long as this page holds; waits for the end.
+    def _await_turn(self, page: int, press: int) -> None:
+        """Wait until the arm no longer runs for an older press.
 
-        Args:
-            what: ``home``, ``open`` or ``closed``.
+        Raises:
+            SessionError: this one was let go meanwhile.
+        """
+        self._end_what_is_over()
+        if self._run is not None:
+            self.client.wait_for(lambda: not self._active, STAND_S)
+        if not self.holds(page, press):
+            raise SessionError("let go before the arm was active")
+
+    def primitive(self, page: int, asked: requests.PrimitivePress, name: str) -> str:
+        """Go home, open or close the gripper, for as long as this press lasts; waits for the end.
 
         Raises:
             SessionError: let go, or it was not done; says why.
         """
+        what, press = asked.name, asked.press
         with self._activating:
             try:
+                self._await_turn(page, press)
                 answer = ask(
                     self.client,
                     "home" if what == "home" else "grip",
                     {} if what == "home" else {"width_m": what},
                     who=f"web-{name}"[:MAX_HOLDER],
-                    cancelled=lambda: not self.holds(page),
+                    cancelled=lambda: not self.holds(page, press),
                 )
             finally:
                 with self._hold_lock:  # it has ended by itself: nothing is to be deactivated
-                    self._hold.release(page)
+                    self._hold.release(page, press)
         if not answer.ok:
             raise SessionError(f"{what}: {answer.reason}{answer.why and f': {answer.why}'}")
         return f"{what}: {answer.reason} after {answer.took_s:.1f} s"
@@ -317,10 +363,10 @@ class RobotLink:
         self.client.publish(self.keys.save, note or "asked on the page")
         return "the rolling record saves its last minutes; the log says where"
 
-    def holds(self, page: int) -> bool:
-        """Whether the hold in force is of this page."""
+    def holds(self, page: int, press: int | None = None) -> bool:
+        """Whether the hold in force is of this page, and of this press of it."""
         with self._hold_lock:
-            return self._hold.held is not None and self._hold.held.page == page
+            return self._hold.holds(page, press)
 
     def beat(self, page: int, press: int, tick_ms: int, hand: OperatorInput) -> bool:
         """Extend a hold by the echo of a tick; False if it is not in force.
@@ -339,39 +385,53 @@ class RobotLink:
             self._hold.expire(time.monotonic())
             return self._hand if self._hold.held is not None else OperatorInput()
 
-    def release(self, page: int, *, gone: bool = False) -> None:
-        """End the hold of a page, if it has it: the arm brakes."""
+    def release(self, page: int, press: int | None = None, *, gone: bool = False) -> None:
+        """End the hold of a page, if it has it: the arm brakes. Of a press: no newer one."""
         with self._hold_lock:
-            held = self._hold.held
-            self._let_go = self._let_go or (held is not None and held.page == page and not gone)
-            (self._hold.forget if gone else self._hold.release)(page)
+            self._let_go = self._let_go or (self._hold.holds(page, press) and not gone)
+            if gone:
+                self._hold.forget(page)
+            else:
+                self._hold.release(page, press)
         self._wake.set()
 
     def _watch_hold(self) -> None:
-        """Keep the liveliness token only while a page holds, whatever the server is doing."""
+        """Keep the liveliness token only while its press holds, whatever the server is doing."""
         while not self._closed.is_set():
             self._wake.wait(WATCH_S)
             self._wake.clear()
+            self._end_what_is_over()
+
+    @property
+    def _active(self) -> bool:
+        task = self.client.task
+        return task is not None and task.active
+
+    def _end_what_is_over(self) -> None:
+        with self._ending:
             with self._hold_lock:
-                before = self._hold.held
+                before, run, active = self._hold.held, self._run, self._active
                 self._hold.expire(time.monotonic())
-                task = self.client.task
-                if self._confirmed and (task is None or not task.active):
-                    self._hold.held = None  # stopped, or ended by itself: a new press starts again
-                held = self._hold.held is not None
+                if run and self._confirmed and not active:  # stopped, or ended by itself
+                    self._hold.release(*run)  # a new press starts again
+                held = run is not None and self._hold.holds(*run)
                 let_go, self._let_go = self._let_go, False
-                self.counters["hold_lost"] += before is not None and not held
+                self.counters["hold_lost"] += before is not None and self._hold.held is None
             self._confirmed = self._confirmed and held
-            if let_go and not held:  # a person ended it: that is no fault to be reported later
+            if let_go:  # a person ended it: that is no fault to be reported later
                 self.client.publish(self.keys.active, "false")
             if not held:  # also one that was declared after the hold had ended
                 self.client.release_deadman()
+                if not active and not self._activating.locked():
+                    self._run = None
 
     def deactivate(self) -> str:
         """Brake the arm, and wait until it stands. Raises SessionError: it does not in time."""
+        began_s = time.monotonic()
         with self._hold_lock:
-            self._hold.held = None
-        if not self.client.deactivate(STAND_S):
+            self._hold.held, self._let_go = None, True
+        self._end_what_is_over()
+        if not self.client.wait_for(lambda: self.client.stands(began_s), STAND_S):
             raise SessionError(f"the command node does not say within {STAND_S:g} s that it stands")
         return "inactive, the arm stands"
 

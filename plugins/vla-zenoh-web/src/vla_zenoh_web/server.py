@@ -346,9 +346,9 @@ class PageServer:
             case requests.StopRequest():
                 self._begin(self._stop(page.person))
             case requests.HoldRequest():
-                self._press(page, request, lambda: link.activate_held(page.number, name))
+                self._press(page, request, lambda: link.activate_held(page.number, request, name))
             case requests.PrimitivePress():
-                self._press(page, request, lambda: link.primitive(page.number, name, request.name))
+                self._press(page, request, lambda: link.primitive(page.number, request, name))
             case requests.BeatRequest():
                 hand = OperatorInput(request.twist, request.opening)
                 if not link.beat(page.number, request.press, request.tick, hand):
@@ -358,7 +358,7 @@ class PageServer:
             case requests.InviteRequest():
                 self._invite(page, request)
             case requests.SettingRequest():
-                self._change(page, name_of(request), lambda: link.set(request))
+                self._change(page, name_of(request), lambda: link.set(page.number, request))
 
     def _invite(self, page: Page, request: requests.InviteRequest) -> None:
         """Tell this page alone the token of the new person, and every page the name."""

@@ -52,8 +52,8 @@ const RECEIVE = {
   event: showEvent,
   welcome: enter,
   denied: (message) => askToken(message.why),
-  done: (message) => { if (message.what === "primitive") endHold(); answer(message.what === "guide" ? "" : message.text || DONE[message.what] || "done", [], "good"); },
-  failed: (message) => { if (message.press) endHold(); answer(message.why, message.reasons, "bad"); },
+  done: (message) => { if (message.what === "primitive" && message.press === press) endHold(); answer(message.what === "guide" ? "" : message.text || DONE[message.what] || "done", [], "good"); },
+  failed: (message) => { if (message.press === press) endHold(); answer(message.why, message.reasons, "bad"); },
   rejected: (message) => answer(`${message.what}: ${message.why}`, [], "bad"),
   hold_ended: (message) => { if (message.press === press) endHold(message.why || "the hold ended: press again"); },
   stopped: showStopped,
@@ -95,6 +95,7 @@ function enter(message) {
   $("which-arm").hidden = parts.length < 2;
   $("events").replaceChildren();
   levels(message.levels || []);
+  handSeen = "";
   $("held").replaceChildren(...parts.map(heldField));
   if (message.drives) watchPictures();
 }
@@ -160,6 +161,11 @@ function showState(message) {
   showPeople(message.people);
   showGuide(message.guide, message.mode);
   keepTrend(message, fastest);
+  const byHand = JSON.stringify(message.hand);
+  if (message.jog && byHand !== handSeen) {
+    handSeen = byHand;
+    for (const [id, value] of Object.entries(message.hand)) $(id).value = value;
+  }
   $("take").setAttribute("aria-pressed", String(message.jog === true));
   setText($("take"), message.jog ? "Hand back" : "Take the arm");
   const grips = typeof (message.arms?.[$("part").value] || {}).width_m === "number";
@@ -306,7 +312,7 @@ function beginHold(way = NONE, grip = 0, primitive = "") {
   if (holding || !welcome.drives || !control) return;
   press += 1;
   holding = performance.now();
-  send(primitive ? { do: "primitive", press, tick, name: primitive } : { do: "hold", press, tick });
+  send(primitive ? { do: "primitive", press, tick, name: primitive } : { do: "hold", press, tick, hand: Boolean(grip) || way.some(Boolean) });
   beatTimer = setInterval(beat, BEAT_MS);
   $("hold").classList.add("held");
   setText($("hold"), "Let go to brake");
@@ -356,6 +362,7 @@ for (const [name, what] of [["Home", "home"], ["Open", "open"], ["Close", "close
   holdable(button, () => beginHold(NONE, 0, what));
   $("primitives").append(button);
 }
+let handSeen = ""; // another page may have chosen since
 function jog(on) { send({ do: "jog", on, frame: $("frame").value, level: Number($("level").value || 1), part: $("part").value }); }
 function levels(given) {
   $("level").replaceChildren(...given.map((speed, at) => el("option", `${(speed * 100).toFixed(0)} cm/s`, { value: at })));
