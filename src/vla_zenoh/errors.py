@@ -183,6 +183,10 @@ def describe_fault(fault: Any) -> str:
     return f"wants {wanted.removeprefix('be ')}"
 
 
+_OF_TYPE = re.compile(r"[a-z-]+\[.*\]|(constrained|function)-.*")
+"""In what Pydantic calls a type."""
+
+
 def describe_faults(error: Any, top: str, most: int = 20, *, given: bool = False) -> str:
     """The faults of a ``ValidationError`` in one line: each with its field, or `top`.
 
@@ -190,7 +194,9 @@ def describe_faults(error: Any, top: str, most: int = 20, *, given: bool = False
     """
     out: list[str] = []
     for fault in error.errors(include_url=False)[:most]:
-        place, value = ".".join(map(str, fault["loc"])) or top, fault.get("input")
+        # Pydantic names the types of a union among the fields.
+        fields = [str(each) for each in fault["loc"] if not _OF_TYPE.fullmatch(str(each))]
+        place, value = ".".join(fields) or top, fault.get("input")
         said = f"{place}: {describe_fault(fault)}" if place else describe_fault(fault)
         if given and isinstance(value, (str, int, float)) and fault["type"] != "missing":
             said += f" (given: {reprlib.repr(value)})"

@@ -531,17 +531,17 @@ class Client(StopClient):
 
     def set_rate(self, rate_hz: float, timeout_s: float | None = None) -> Task:
         """Set the rate of action chunks, as `set_prompt`; `CodecError`: it is not allowed."""
-        settings.decode_rate(f"{rate_hz:g}".encode())
+        rate_hz = settings.decode_rate(str(rate_hz).encode())
         return self._set_number("rate", rate_hz, lambda task: task.rate_hz, timeout_s)
 
     def set_speed(self, percent: float, timeout_s: float | None = None) -> Task:
         """Set the speed override, 0 to 100 percent of the planned speed, as `set_prompt`."""
-        settings.decode_percent(f"{percent:g}".encode())
+        percent = settings.decode_percent(str(percent).encode())
         return self._set_number("speed", percent, lambda task: task.speed_percent, timeout_s)
 
     def slow_down(self, percent: float, timeout_s: float | None = None) -> Task:
         """Lower the speed override; rejected if that would make the arm faster."""
-        settings.decode_percent(f"{percent:g}".encode())
+        percent = settings.decode_percent(str(percent).encode())
         return self._set_number("slower", percent, lambda task: task.speed_percent, timeout_s)
 
     def _set_number(

@@ -209,6 +209,9 @@ class RemoteRobot(Client):
                 return sample
         if why := self.reception.short().get(self.keys.short(key)):
             raise SessionError(f"nothing came within {timeout_s:g} s; {why}")
+        status = self.status(self.profile.robot.node)
+        if why := status and status.detail.get("complaint"):
+            raise SessionError(f"nothing was published on {key} for {timeout_s:g} s: {why}")
         raise SessionError(
             f"nothing was published on {key} for {timeout_s:g} s; `vla-zenoh keys` shows which "
             "keys have a publisher"

@@ -26,6 +26,8 @@ from vla_zenoh.types.records import Joints
 
 MOVING_M_S = 0.002
 """Fingers faster than this move."""
+WIDTH_ROOM, WIDTH_ROOM_M = 0.2, 0.005
+"""A gripper may measure beyond its ends by this part of its width, and this much."""
 BEYOND = 10.0
 """A joint may report this multiple of the range and speed of its description: zero points are set
 in many ways, garbage is further off."""
@@ -301,6 +303,7 @@ class JointReading:
             raise CodecError("invalid", f"a finger joint beyond {FURTHEST:g} m or rad")
         self._finger_newness.check(made_ns)
         width_m = self._fingers.width_m(positions)
+        self.check_width(width_m)
         elapsed_s = (stamp_ns - self.width_stamp_ns) / 1e9
         velocity = None if joints.velocity is None else joints.velocity[at]
         if velocity is not None and bool((np.abs(velocity) <= FURTHEST).all()):
@@ -308,6 +311,16 @@ class JointReading:
         elif self.width_m is not None and 0 < elapsed_s < 1:
             self._finger_speed_m_s = abs(width_m - self.width_m) / elapsed_s
         self.width_m, self.width_stamp_ns = width_m, stamp_ns
+
+    def check_width(self, width_m: float) -> None:
+        """Raise a `CodecError` for a width that the gripper cannot have."""
+        most_m, room_m = self._max_width_m, WIDTH_ROOM * self._max_width_m + WIDTH_ROOM_M
+        if not -room_m <= width_m <= most_m + room_m:
+            raise CodecError(
+                "invalid",
+                f"width_m is {width_m:.4g}, and the gripper opens from 0 to {most_m:g} m "
+                "(robot.gripper.max_width_m): is this a share, percent or millimetres?",
+            )
 
     # -- state --------------------------------------------------------------------------------
     def measurement(self, wrench: FloatArray | None, gripper: GripperState | None) -> Measurement:
@@ -334,7 +347,7 @@ class JointReading:
         if self.width_m is None:
             return None
         moving = busy or self._finger_speed_m_s > MOVING_M_S
-        return GripperState(min(max(self.width_m, 0.0), 1.0), moving, held and not moving)
+        return GripperState(max(self.width_m, 0.0), moving, held and not moving)
 
 
 def _finite(what: str, values: FloatArray) -> FloatArray:

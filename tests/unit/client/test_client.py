@@ -22,7 +22,7 @@ from vla_zenoh.cli.drive import _reaches
 from vla_zenoh.client.client import MAX_NODES, MAX_WHY, Client
 from vla_zenoh.client.remote_robot import RemoteRobot
 from vla_zenoh.codec import message, records
-from vla_zenoh.errors import SessionError
+from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import Kind, last_chunk
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
@@ -376,3 +376,10 @@ def test_a_state_of_a_robot_that_is_gone_is_not_returned_as_where_it_is(profile:
         for _ in range(2):
             with pytest.raises(SessionError, match="nothing was published on vla/panda/state/pose"):
                 robot.pose_state(0.2)
+        detail = {"complaint": "my_arm.py: read: nan"}
+        said = NodeStatus("sim", "running", "here", 1, 1, {}, {}, {}, {}, detail)
+        robot.status_received("sim", said, 100)
+        with pytest.raises(SessionError, match=r"state/pose for 0.2 s: my_arm.py: read: nan"):
+            robot.pose_state(0.2)
+        with pytest.raises(CodecError, match="'fast' is not a percentage"):
+            robot.set_speed("fast")  # pyright: ignore[reportArgumentType]

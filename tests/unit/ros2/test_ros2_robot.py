@@ -91,6 +91,8 @@ def test_other_robots_joints_say_nothing(arm: JointReading) -> None:
         (joints(velocity=np.array([1e308, *np.zeros(8)])), "invalid"),
         (joints(position=np.array([-1e306, *np.zeros(8)])), "invalid"),
         (joints(position=np.array([*np.zeros(7), 1e308, 1e308])), "invalid"),
+        # Fingers that report a share of their opening, not metres.
+        (joints(position=np.array([*np.zeros(7), 0.5, 0.5])), "invalid"),
     ],
 )
 def test_what_is_not_whole_is_refused(arm: JointReading, message: Joints, why: str) -> None:
