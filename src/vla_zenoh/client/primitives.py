@@ -23,6 +23,10 @@ NO_NODE = (
     "nothing answers on {key}: the node primitives does not run, or this certificate may not query "
     "it. Start it with `vla-zenoh node primitives`, or name it in hosts.HOST.nodes of the profile"
 )
+LOST = (
+    "the node primitives runs, but no answer of it on {key} came in time: this program or its link "
+    "stood still, and the arm braked, or this certificate may not query it"
+)
 
 
 class PrimitiveError(SessionError):
@@ -81,4 +85,4 @@ def ask(
     if replies and replies[0].err is not None:
         said = bytes_of(replies[0].err.payload, MAX_ANSWER_BYTES).decode("utf-8", "replace")
         raise SessionError(f"{primitive}: {said[:500]}")
-    raise SessionError(NO_NODE.format(key=key))
+    raise SessionError((LOST if "primitives" in client.alive else NO_NODE).format(key=key))

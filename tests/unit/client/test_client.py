@@ -20,6 +20,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.drive import _reaches
 from vla_zenoh.client.client import MAX_NODES, MAX_WHY, Client
+from vla_zenoh.client.primitives import ask
 from vla_zenoh.client.remote_robot import RemoteRobot
 from vla_zenoh.codec import message, records
 from vla_zenoh.errors import CodecError, SessionError
@@ -101,6 +102,21 @@ def test_a_person_with_another_version_is_told_which_side_to_update(
         there.put(profile.keys.status("command"), status, attachment=ours)
         until("it was updated", lambda: not client.unreadable)
         token.undeclare()
+
+
+@pytest.mark.parametrize(("runs", "why"), [(False, "does not run"), (True, "stood still")])
+def test_a_primitive_that_nothing_answers_says_whether_its_node_runs(
+    profile: Profile, runs: bool, why: str
+) -> None:
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        client = Client(profile, here).subscribe()
+        if runs:
+            token = there.liveliness().declare_token(profile.keys.alive("primitives"))
+            until("the node is there", lambda: "primitives" in client.alive)
+        with pytest.raises(SessionError, match=f"primitives.*{why}"):
+            ask(client, "home", {"timeout_s": ASK_S})
+        if runs:
+            token.undeclare()
 
 
 ASK_S = 0.2

@@ -52,6 +52,7 @@ from vla_zenoh_dataset.videos import chosen
 from vla_zenoh_policy_servers.state_vector import read_parts
 
 from vla_zenoh.errors import RecordingError, SpecError
+from vla_zenoh.lab.evaluation.evaluate import evaluate
 from vla_zenoh.lab.recording.run import Run, load_run, pictures
 from vla_zenoh.lab.recording.writer import CLOCK_SET, RecordingWriter
 from vla_zenoh.policy import ActionSpec, standing_step
@@ -675,6 +676,15 @@ def test_an_episode_that_is_in_two_recordings_is_exported_once_from_the_one_that
     assert "at 0.5 s is in" in whole
     assert "a.mcap: the episode at 3.0 s is in" in cut
     assert "b.mcap as well, and is taken from there" in cut
+
+
+def test_an_evaluation_says_which_recordings_hold_the_same_time(tmp_path: Path) -> None:
+    for name, commander in (("a", "command#1"), ("b", "command#1"), ("c", "command#2")):
+        make_run(tmp_path / f"{name}.mcap", commander=commander)
+    runs, _ = evaluate([tmp_path])
+    told = [[why for why in run.problems if "counts twice in ALL" in why] for run in runs]
+    assert [len(problems) for problems in told] == [0, 1, 0]
+    assert "a.mcap" in told[1][0]
 
 
 def test_an_episode_that_a_recording_ended_before_is_no_failure(tmp_path: Path) -> None:

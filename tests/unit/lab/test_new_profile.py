@@ -368,3 +368,15 @@ def test_a_picture_that_exists_is_kept_and_no_profile_is_written(tmp_path: Path)
     assert done.exit_code == 1
     assert "arm.svg exists" in str(done.exception or done.stderr)
     assert (old.read_text(), list(tmp_path.iterdir())) == ("mine", [old])
+
+
+def test_an_arm_that_cannot_be_mended_is_named_by_the_file_that_was_given(tmp_path: Path) -> None:
+    source, profile = tmp_path / "stuck.urdf", tmp_path / "arm.yaml"
+    stuck = Row("j2", axis=Y, ends=(0.0, 0.0), limit='<limit lower="0" upper="0" effort="1"/>')
+    source.write_text(urdf([*arm(SIX, j2=stuck), TOOL]))
+    done = CliRunner().invoke(app, ["profile", "new", str(source), "-o", str(profile), "--yes"])
+    assert done.exit_code == 1
+    said = str(done.exception or done.stderr)
+    assert "stuck.urdf" in said
+    assert "mended" not in said
+    assert list(tmp_path.iterdir()) == [source]

@@ -15,7 +15,7 @@ import typer
 
 from vla_zenoh.cli.options import JsonOption, model_options, options
 from vla_zenoh.cli.output import console, errors, fail, styled
-from vla_zenoh.errors import OutputError, VlaZenohError
+from vla_zenoh.errors import OutputError, ProfileError, VlaZenohError
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.profile.check import check_profile
@@ -147,10 +147,12 @@ def new(
             if found is not None:
                 drive, notes = driven(found, arm, answers, running.connect)
                 notes = [*_described(found, source, arm), *notes]
-        except VlaZenohError:
+        except VlaZenohError as error:
             for each in texts:
                 each.unlink(missing_ok=True)
             shutil.rmtree(meshes_of(copy), ignore_errors=True)
+            if copy.name in str(error):  # which nobody has seen
+                raise ProfileError(str(error).replace(copy.name, source.name)) from error
             raise
         named = description if arm.file == source and _is_named(description or "") else ""
         path = named or os.path.relpath(arm.file.resolve(), file.resolve().parent)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,20 @@ def recordings(paths: Iterable[Path]) -> Iterator[Path]:
                 yield each
 
 
+class _Held(NamedTuple):
+    """What a recording holds: the processes that commanded the robot, and the time (ns)."""
+
+    path: Path
+    commanders: set[str]
+    began_ns: int
+    ended_ns: int
+
+    def overlaps(self, other: _Held) -> bool:
+        """Whether both are of one robot at one time: of two recorders, or two saves of one."""
+        together = self.began_ns < other.ended_ns and other.began_ns < self.ended_ns
+        return together and not self.commanders.isdisjoint(other.commanders)
+
+
 def evaluate(
     paths: Sequence[Path],
     *,
@@ -67,13 +81,22 @@ def evaluate(
 
     runs: list[Evaluation] = []
     faults: dict[str, str] = {}
+    held: list[_Held] = []
     for path in paths:
         found = list(recordings([path]))
         if not found:
             faults[str(path)] = EMPTY.format(path)
         for file in found:
             try:
-                runs += evaluate_parts(load_run(file), pictures=pictures)
+                run = load_run(file)
+                own = _Held(file, run.commanders, run.began_ns, run.ended_ns)
+                run.problems += [
+                    f"it overlaps with {other.path}: what both hold counts twice in {COMBINED}"
+                    for other in held
+                    if own.overlaps(other)
+                ]
+                held.append(own)
+                runs += evaluate_parts(run, pictures=pictures)
             except RecordingError as error:
                 faults[str(file)] = str(error)
             evaluated(file)

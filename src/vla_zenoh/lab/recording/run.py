@@ -162,6 +162,11 @@ class Run:
         return out
 
     # -- intervals, by the stamps of the writers: a replayed run is divided as the original is ----
+    @property
+    def commanders(self) -> set[str]:
+        """Processes that commanded the robot, as they name themselves."""
+        return {task.header.source for task in self.tasks}
+
     def activations(self) -> list[Span]:
         """Each interval in which the arm obeyed one worker."""
         return [
