@@ -95,10 +95,10 @@ class RecordedEpisode:
 
     def is_copy_of(self, other: RecordedEpisode) -> bool:
         """Whether both are of one robot at one time: by the process that commanded it."""
-        one, two = (newest(each.run.tasks, each.since_ns) for each in (self, other))
-        if one is None or two is None or one.header.source != two.header.source:
+        if self.until_ns <= other.since_ns or other.until_ns <= self.since_ns:
             return False
-        return self.since_ns < other.until_ns and other.since_ns < self.until_ns
+        one, two = (newest(each.run.tasks, each.since_ns) for each in (self, other))
+        return one is not None and two is not None and one.header.source == two.header.source
 
     def after_s(self, at_ns: int) -> float:
         """Seconds from the beginning of the recording to a time, wall clock."""
