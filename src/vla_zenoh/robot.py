@@ -52,7 +52,7 @@ class Reading:
             ``limits.contact.effort_stop_nm`` to have it monitored.
         width_m: opening of the gripper; None: not measured, that of the last command is assumed.
             Only with a gripper that the profile declares (``robot.gripper``).
-        moving: the gripper moves; it does anyway while `width_m` changes.
+        moving: the gripper moves, and is sent no other width until it stands.
         holding: the gripper holds an object.
         wrench: (6,) external N and Nm at the TCP, base axes, without the weight of arm and tool,
             monitored by `limits.contact`. None: not measured.

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import operator
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,6 @@ FAULT_NS = 200_000_000
 """A fault lasts at least this long: only the newest state is used, and a single one could be
 missed."""
 RELEASED_M = 0.002
-FINGERS_MOVED_M, STILL_NS = 0.001, 300_000_000
-"""Fingers whose width did not change by so much for so long stand: slower ones count as standing,
-and so does the noise of a sensor."""
 """Fingers that are this much wider apart than around an object were opened."""
 
 
@@ -58,8 +54,6 @@ class PythonDriver(RobotDriver):
         self._rate = RateMeter()
         self._asked_m = profile.robot.max_width_m
         self._width_m: float | None = None
-        self._fingers: tuple[float, int] | None = None
-        """Where they were when they moved last, and when."""
         self._held_m: float | None = None
         """Width at which an object is held."""
         self.recovers = callable(getattr(self.robot, "recover", None))
@@ -121,22 +115,12 @@ class PythonDriver(RobotDriver):
         self._complaint = ""
         gripper = measured.gripper
         assert gripper is not None
-        if gripper.width_m is not None and self._fingers_move(gripper.width_m, mono_ns):
-            gripper = replace(gripper, moving=gripper.moving or not gripper.holding)
-            measured = measured._replace(gripper=gripper)
         self.measured_ns, self._width_m = measured_ns, gripper.width_m
         # While the fingers move nobody knows.
         if gripper.width_m is not None and not gripper.moving:
             self._set_held(gripper.width_m, holding=gripper.holding)
         self._rate.tick()
         return measured
-
-    def _fingers_move(self, width_m: float, at_ns: int) -> bool:
-        """Whether the width has changed just now: not every robot says that its fingers move."""
-        was_m, since_ns = self._fingers or (width_m, at_ns - STILL_NS)
-        changed = abs(width_m - was_m) > FINGERS_MOVED_M
-        self._fingers = (width_m, at_ns) if changed else (was_m, since_ns)
-        return at_ns - self._fingers[1] < STILL_NS
 
     def _set_held(self, width_m: float, *, holding: bool) -> None:
         held_m = self._held_m

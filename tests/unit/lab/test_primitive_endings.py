@@ -96,6 +96,15 @@ def test_a_grip_ends_where_the_fingers_rest() -> None:
     assert over(Gripped(0.0, closing=True), GRIPPED_S, width_m=0.05) == "reached"
 
 
+def test_a_grip_does_not_end_while_the_width_changes_though_the_robot_says_nothing_of_it() -> None:
+    grip = Gripped(0.0, closing=True)
+    widths_m = [*np.arange(0.08, 0.03, -0.02 * PERIOD_S), *[0.03 + 1e-4] * 500]
+    ends = [grip.check(sight(n * PERIOD_S, width_m=width_m)) for n, width_m in enumerate(widths_m)]
+    rests = len(widths_m) - 500
+    assert not any(ends[:rests])
+    assert ends[-1] == "reached"
+
+
 @pytest.mark.parametrize(
     ("until", "before", "after"),
     [

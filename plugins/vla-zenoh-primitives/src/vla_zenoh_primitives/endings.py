@@ -23,6 +23,8 @@ STUCK_S = 2.5
 LEAST_SPEED = 0.05
 GRIPPED_S = 0.7
 """A gripper that has not moved for this long stands: a command takes a moment to arrive."""
+MOVED_M = 0.001
+"""Fingers that move further do move: not every robot says so. A sensor's noise is less."""
 WIDTH_TOLERANCE_M = 0.003
 SHUT, WIDE = 0.1, 0.9
 """Shares of the largest width."""
@@ -122,12 +124,12 @@ class Gripped:
 
     def __init__(self, width_m: float, *, closing: bool) -> None:
         self._width_m, self._closing = width_m, closing
-        self._moved_s = -np.inf
+        self._moved_s, self._stood_m = -np.inf, np.inf
 
     def check(self, sight: Sight) -> str:
         gripper = sight.gripper
-        if gripper.moving or self._moved_s == -np.inf:
-            self._moved_s = sight.now_s
+        if gripper.moving or abs(gripper.opening_m - self._stood_m) > MOVED_M:
+            self._moved_s, self._stood_m = sight.now_s, gripper.opening_m
         if sight.now_s - self._moved_s < GRIPPED_S:
             return ""
         off_m = abs(gripper.opening_m - self._width_m)
