@@ -347,7 +347,7 @@ class JointReading:
         if self.width_m is None:
             return None
         moving = busy or self._finger_speed_m_s > MOVING_M_S
-        return GripperState(max(self.width_m, 0.0), moving, held and not moving)
+        return GripperState(min(max(self.width_m, 0.0), 1.0), moving, held and not moving)
 
 
 def _finite(what: str, values: FloatArray) -> FloatArray:
